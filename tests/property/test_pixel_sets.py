@@ -41,11 +41,6 @@ def test_quantiles_are_those_of_scipy(share, freedom):
     assert chi_squared.survival(x, freedom) == pytest.approx(stats.chi2.sf(x, freedom), rel=1e-9)
 
 
-@pytest.mark.parametrize(("share", "freedom"), [(0.95, 2), (0.999, 1), (0.999, 48), (0.999, 47)])
-def test_quantiles_that_estimators_use(share, freedom):
-    assert chi_squared.quantile(share, freedom) == pytest.approx(stats.chi2.ppf(share, freedom), rel=1e-13)
-
-
 @pytest.mark.parametrize(("share", "freedom"), [(0.0, 2), (1.0, 2), (0.5, 0)])
 def test_quantiles_need_a_share_and_freedom(share, freedom):
     with pytest.raises(ValueError, match="must be inside"):

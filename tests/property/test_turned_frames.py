@@ -9,6 +9,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from simtest.calibration import Calibration, CameraPrior, Normal, Priors, exactly
 from simtest.estimators import motion_signs, photometric
@@ -67,7 +69,7 @@ def picture(lens, light, turn):
     return (values / values.max() + noise).astype(np.float32)
 
 
-def given(light, turn, distance=EXACT):
+def known(light, turn, distance=EXACT):
     """Return what is known, in the turned frame."""
     covariance = turn @ np.array([[0.1, 0.05, 0.0], [0.05, 0.4, -0.1], [0.0, -0.1, 0.2]]) @ turn.T
     return Priors(
@@ -84,7 +86,7 @@ def answered(lens, light, turn=None):
     else:
         matrix, change = TURNS[turn] if turn else (np.eye(3), lambda same: same)
         frame = np.ascontiguousarray(change(picture(lens, LIGHTS[light], np.eye(3))))
-    (found,) = reconstruct(frame, Calibration(camera(lens), priors=given(LIGHTS[light], matrix)), ESTIMATORS)
+    (found,) = reconstruct(frame, Calibration(camera(lens), priors=known(LIGHTS[light], matrix)), ESTIMATORS)
     return found.estimates
 
 
@@ -156,7 +158,7 @@ def test_the_part_of_the_distance_is_how_far_the_normal_moves(name):
     frame, light = picture("pinhole", LIGHTS["aside"], np.eye(3)), LIGHTS["aside"]
 
     def estimate(distance):
-        priors = given(light, np.eye(3), distance)
+        priors = known(light, np.eye(3), distance)
         return reconstruct(frame, Calibration(camera("pinhole"), priors=priors), [name])[0].estimates[name]
 
     near, far = (estimate(exactly(25.0 + step)).normal for step in (-1.0, 1.0))
@@ -212,3 +214,27 @@ def test_the_photometric_frame_turns_with_its_step():
     moved = replace(model).moved(step)
     assert np.allclose(basis @ (moved.normal - normal), -step[:2], atol=1e-9)
     assert np.allclose(moved.frame @ moved.frame.T, np.eye(3), atol=1e-12)
+
+
+# The basis itself -----------------------------------------------------------------------------------------------------
+
+
+COORDINATE = st.floats(-1, 1)
+
+
+@given(st.tuples(COORDINATE, COORDINATE, COORDINATE).filter(lambda drawn: np.linalg.norm(drawn) > 1e-3))
+def test_the_basis_is_orthonormal_right_handed_and_one(drawn):
+    normal = np.array(drawn) / np.linalg.norm(drawn)
+    first, second = (axis[0] for axis in tangent_basis(normal[None]))
+    rows = np.stack([first, second, normal])
+    np.testing.assert_allclose(rows @ rows.T, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(np.cross(first, second), normal, atol=1e-14)
+    np.testing.assert_array_equal(basis_across(normal), [first, second])
+
+
+def test_the_basis_is_that_of_every_release():
+    """To the letter, since it says what a stored covariance means: also beside the pole where z changes its sign."""
+    np.testing.assert_array_equal(basis_across(np.array([0.0, 0.0, 1.0])), [[1, 0, 0], [0, 1, 0]])
+    np.testing.assert_array_equal(basis_across(np.array([0.0, 0.0, -1.0])), [[1, 0, 0], [0, -1, 0]])
+    np.testing.assert_allclose(basis_across(np.array([0.6, 0.0, -0.8])), [[0.8, 0, 0.6], [0, -1, 0]], atol=1e-15)
+    np.testing.assert_allclose(basis_across(np.array([0.0, 0.6, 0.8])), [[1, 0, 0], [0, 0.8, -0.6]], atol=1e-15)

@@ -8,63 +8,14 @@ from simtest.errors import Failure, Reason
 from simtest.geometry import Camera, Patch
 from simtest.reconstruction.options import DEFAULT_ESTIMATORS
 from simtest.reconstruction.pipeline import reconstruct
-from simtest.spec import load_camera
 from tests.refusals import refused
 
 # Cameras ---------------------------------------------------------------------------------------------------------
 
-CALIBRATION = "width = 32\nheight = 24\nfx = 40\nfy = 40\n"
-CAMERAS = {
-    "missing key": (
-        CALIBRATION.replace("fy = 40\n", ""),
-        "fy: missing; a camera needs width, height, and fx and fy or fov_deg",
-    ),
-    "mistyped key": (CALIBRATION.replace("fy", "fz"), "fz = 40: unknown key; allowed: "),
-    "text": ("a calibration", "not valid TOML"),
-    "NaN": (CALIBRATION.replace("fx = 40", "fx = nan"), "fx = nan: must be a finite number"),
-    "in quotes": (CALIBRATION.replace("fx = 40", 'fx = "40"'), "fx = '40': must be a number"),
-    "singular": (CALIBRATION.replace("fy = 40", "fy = 0"), "fy = 0: must be greater than"),
-    "fractional": (CALIBRATION.replace("32", "32.5"), "width = 32.5: must be a valid integer"),
-    "unknown key": (CALIBRATION + "fov = 60", "fov = 60: unknown key; allowed: fov_deg, width, height"),
-    "no table": ("camera = 5", "width: missing"),
-    "table without keys": ("[camera]\nwidth = 32", "height: missing"),
-}
-
-
-@pytest.mark.parametrize("name", CAMERAS)
-def test_camera_files(tmp_path, name):
-    text, fragment = CAMERAS[name]
-    path = tmp_path / "camera.toml"
-    path.write_text(text)
-    refused(lambda: load_camera(path), f"{path}: ", fragment)
-
-
 K = [[40.0, 0.0, 16.0], [0.0, 40.0, 12.0], [0.0, 0.0, 1.0]]
-MATRICES = {
-    "zero": (np.zeros((3, 3)), "must be upper triangular with K[2][2] = 1"),
-    "singular": (np.diag([0.0, 40.0, 1.0]), "camera.fx = ", "must be > 0, else K is singular"),
-    "mirrored": (np.diag([40.0, -40.0, 1.0]), "camera.fy = ", "must be > 0, else K is singular"),
-    "shape": (K[:2], "K has shape (2, 3): must be (3, 3)"),
-    "4 x 4": (np.eye(4), "K has shape (4, 4): must be (3, 3)"),
-    "transposed": (np.transpose(K), "must be upper triangular with K[2][2] = 1"),
-    "all NaN": (np.full((3, 3), np.nan), "must be upper triangular"),
-    "one NaN": ([[40.0, 0.0, np.nan], *K[1:]], "camera.cx = ", "must be a finite number"),
-    "infinite": ([[np.inf, 0.0, 16.0], *K[1:]], "camera.fx = ", "must be a finite number"),
-}
 
 
-@pytest.mark.parametrize("name", MATRICES)
-def test_calibration_matrices(name):
-    matrix, *fragments = MATRICES[name]
-    refused(lambda: Camera.from_matrix(matrix, 32, 24), *fragments)
-
-
-@pytest.mark.parametrize("width", [0, -32, 32.5])
-def test_camera_sizes(width):
-    refused(lambda: Camera.from_matrix(K, width, 24), f"camera.width = {width}: must be an integer >= 1")
-
-
-@pytest.mark.parametrize("fov", [0, 1e-300, 0.04, 179.1, 179.9999999, 180, -60, float("nan"), float("inf")])
+@pytest.mark.parametrize("fov", [0, 0.04, 179.1, -60, float("nan"), float("inf")])
 def test_fields_of_view(fov):
     refused(lambda: Camera.from_fov(fov, 32, 24), f"fov = {fov}: must be 0.05 to 179 deg")
 
@@ -85,25 +36,19 @@ def with_value(value):
 
 FRAMES = {
     "NaN": (with_value(np.nan), "frame holds 1 values that are NaN, infinite"),
-    "infinity": (with_value(-np.inf), "frame holds 1 values that are NaN, infinite"),
     "infinities of both signs": (np.stack([SPOT + np.inf, SPOT - np.inf], 2), "frame holds 768 values"),
     "beyond float32": (with_value(1e300), "frame holds 1 values", "beyond 3e38: all must be finite"),
+    "none above 0": (np.where(SPOT > 0.5, 0.0, -1.0), "frame holds values from -1 to 0: some must be above 0"),
     "turned": (SPOT.T, "frame is 24 x 32 px: must be 32 x 24, the size of the camera's calibration"),
-    "1 x 1": ([[1.0]], "frame is 1 x 1 px: must be 32 x 24"),
     "one number": (1.0, "frame has shape (): must be (H, W) or (H, W, C)"),
-    "a line": (SPOT[0], "frame has shape (32,): must be (H, W) or (H, W, C)"),
     "four dimensions": (SPOT[None, None], "frame has shape (1, 1, 24, 32): must be (H, W) or (H, W, C)"),
-    "empty": ([], "frame has shape (0,): must be (H, W) or (H, W, C)"),
     "no channels": (np.empty((HEIGHT, WIDTH, 0)), "frame has shape (24, 32, 0)"),
     "a file's name": ("frame.png", "frame holds values of type <U9: must be an array of real numbers"),
     "numbers in quotes": ([["1", "2"], ["3", "4"]], "frame holds values of type <U1"),
     "ragged": ([[1, 2], [3]], "frame: must be an array of numbers; its rows differ in length"),
-    "nothing": (None, "frame holds values of type object: must be an array of real numbers"),
     "complex": (SPOT * 1j, "frame holds values of type complex128: must be an array of real numbers"),
-    "dates": (np.zeros((HEIGHT, WIDTH), "datetime64[s]"), "frame holds values of type datetime64[s]"),
     "integers of no range": (np.zeros((HEIGHT, WIDTH), int), "integers of type int64, whose range is not known"),
     "a picture of two channels": (np.zeros((HEIGHT, WIDTH, 2), np.uint8), "frame: has 2 channels; must have 1, 3 or 4"),
-    "a picture of another size": (np.zeros((5, 6, 3), np.uint16), "frame is 6 x 5 px: must be 32 x 24"),
 }  # fmt: skip
 
 
@@ -113,7 +58,7 @@ def test_frames(name):
     refused(lambda: reconstruct(frame, EYE), *fragments)
 
 
-@pytest.mark.parametrize("peak", [(2, 2), (4, 8), (8, 4), (14, 8), (8, 14), (-1, 8)])
+@pytest.mark.parametrize("peak", [(4, 8), (8, 4), (14, 8), (8, 14), (-1, 8)])
 def test_a_peak_outside_its_region(peak):
     """An index below 0 took the value of the pixel that is counted from the far end."""
     refused(lambda: Patch.cut(SPOT, (5, 5, 9, 9), peak), f"peak = {peak[0]},{peak[1]}: must lie inside its region")
@@ -122,22 +67,15 @@ def test_a_peak_outside_its_region(peak):
 ARGUMENTS = {
     "roi outside": ({"roi": (0, 0, 33, 24)}, "roi = 0,0,33,24: must be x,y,w,h inside the 32 x 24 frame"),
     "roi beyond the corner": ({"roi": (31, 23, 2, 2)}, "roi = 31,23,2,2: must be x,y,w,h inside"),
-    "roi of no size": ({"roi": (4, 4, 0, 5)}, "roi = 4,4,0,5: must be x,y,w,h inside"),
-    "roi negative": ({"roi": (-1, 0, 5, 5)}, "roi = -1,0,5,5: must be x,y,w,h inside"),
     "roi of negative size": ({"roi": (9, 9, 5, -5)}, "roi = 9,9,5,-5: must be x,y,w,h inside"),
-    "roi of three": ({"roi": (1, 2, 3)}, "roi = (1, 2, 3): must be x, y, width, height: four integers, px"),
     "roi fractional": ({"roi": (1.5, 0, 4, 4)}, "roi = (1.5, 0, 4, 4): must be x, y, width, height: four integers"),
-    "roi NaN": ({"roi": (float("nan"), 0, 4, 4)}, "roi = (nan, 0, 4, 4): must be x, y, width, height"),
     "roi text": ({"roi": "1,2,3,4"}, "roi = '1,2,3,4': must be x, y, width, height: four integers, px"),
-    "smoothing negative": ({"smoothing_px": -1}, "smoothing_px = -1: must be a number in [0, 50]"),
     "smoothing huge": ({"smoothing_px": 1e9}, "smoothing_px = 1000000000.0: must be a number in [0, 50]"),
     "smoothing NaN": ({"smoothing_px": float("nan")}, "smoothing_px = nan: must be a number in [0, 50]"),
-    "smoothing text": ({"smoothing_px": "2"}, "smoothing_px = '2': must be a number in [0, 50]"),
     "smoothing true": ({"smoothing_px": True}, "smoothing_px = True: must be a number in [0, 50]"),
     "unknown estimator": ({"estimators": ["magic"]}, "estimator 'magic': not installed; allowed: "),
     "estimator twice": ({"estimators": ["cone_axis"] * 2}, "estimator 'cone_axis': given twice"),
     "estimators one name": ({"estimators": "cone_axis"}, "estimators = 'cone_axis': must be a list of names"),
-    "estimators numbers": ({"estimators": [5]}, "estimators = [5]: must be a list of names"),
     "encoding unknown": ({"encoding": "rec709"}, "encoding = 'rec709': must be one of srgb, linear, or None"),
     "encoding of large values": ({"encoding": "srgb", "frame": 255 * SPOT}, "encoded real values must lie in [0, 1]"),
     "encoding told twice": (
@@ -183,7 +121,7 @@ def test_a_region_without_a_peak_is_a_failure(name):
     assert all(isinstance(e, Failure) and e.reason == Reason.NO_PEAK for e in found.estimates.values())
 
 
-@pytest.mark.parametrize("size", [(1, 1), (2, 2), (1, 32), (24, 2), (3, 3)])
+@pytest.mark.parametrize("size", [(1, 1), (1, 32), (24, 2), (3, 3)])
 def test_tiny_frames(size):
     frame = SPOT[12 : 12 + size[0], : size[1]] if size[0] < 24 else SPOT[:, 16:18]
     camera = Camera.from_matrix(K, size[1], size[0])
@@ -198,7 +136,7 @@ def test_tiny_frames(size):
     }
 
 
-@pytest.mark.parametrize("scale", [1e-40, 1e-30, 1e30, 1e38])
+@pytest.mark.parametrize("scale", [1e-40, 1e38])
 def test_the_scale_of_a_frame_does_not_matter(scale):
     (found,) = reconstruct(SPOT * scale, EYE)
     assert all(not isinstance(estimate, Failure) for estimate in found.estimates.values())

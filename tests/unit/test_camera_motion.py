@@ -7,18 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import simtest
-from simtest.dataset.maker import Maker
-from simtest.dataset.plan import Plan
 from simtest.errors import InputError
-from simtest.estimators import load_estimators
 from simtest.rendering import Session
 from simtest.simulation.frame_files import write_frame
-from simtest.spec import Experiment, load_camera, scene_from_dict
+from simtest.spec import load_camera, scene_from_dict
 from simtest.spec.camera import Motion
-from simtest.spec.recipes import Dataset
-from simtest.spec.spec_model import validate
-from simtest.validation.cases import expand
-from simtest.validation.realisation import Realiser
 
 pytestmark = pytest.mark.render
 
@@ -230,68 +223,6 @@ def test_a_frames_files_say_what_moved(tmp_path):
     for name in ("camera.toml", "calibration.toml"):
         assert "motion" not in (tmp_path / name).read_text()
         assert load_camera(tmp_path / name).width == CAMERA["width"]
-
-
-def test_a_camera_file_with_a_motion_is_refused(tmp_path):
-    path = tmp_path / "camera.toml"
-    path.write_text("width = 10\nheight = 10\nfx = 10.0\nfy = 10.0\nmotion = {}\n")
-    with pytest.raises(InputError, match=r"motion = \{\}: unknown key"):
-        load_camera(path)
-
-
-def test_a_dataset_draws_velocities():
-    family = {
-        "scene": "sphere",
-        "set": {"camera.width": 48, "camera.height": 36, "camera.fx": 48.0, "camera.fy": 48.0,
-                "camera.motion": {"velocity_mm_s": [0.0, 0.0, 0.0], "steps": 3}},
-        "per_sample": {"camera.motion.velocity_mm_s.0": {"low": 20.0, "high": 200.0},
-                       "camera.motion.exposure_s": {"low": 0.005, "high": 0.02, "log": True}},
-    }  # fmt: skip
-    splits = {"train": 1.0, "validation": 0.0, "test": 0.0}
-    plan = Plan(validate(Dataset, {"name": "moving", "samples": 2, "families": [family], "splits": splits}, "dataset"))
-    samples = [Maker(plan).make(index) for index in range(2)]
-    speeds = [sample.meta["scene"]["camera"]["motion"]["velocity_mm_s"] for sample in samples]
-    assert 20 <= speeds[0][0] != speeds[1][0] <= 200
-    assert speeds[0][1:] == [0.0, 0.0]
-    np.testing.assert_array_equal(Maker(plan).make(1).images["image"], samples[1].images["image"])
-
-
-def test_an_experiment_sweeps_a_velocity():
-    """Frames and names of the settings differ, and the truth stays."""
-    group = {
-        "scene": "sphere",
-        "set": {"camera.width": 96, "camera.height": 96, "camera.fx": 96.0, "camera.fy": 96.0,
-                "camera.motion": {"velocity_mm_s": [0.0, 0.0, 0.0], "exposure_s": 0.02, "steps": 4}},
-        "sweep": [{"camera.motion.velocity_mm_s.1": [0.0, 25.0]}],
-    }  # fmt: skip
-    experiment = validate(Experiment, {"name": "moving", "groups": [group]}, "experiment")
-    cases = expand(experiment)
-    assert [case.setting for case in cases] == ["sphere, velocity_mm_s.1=0.0", "sphere, velocity_mm_s.1=25.0"]
-    realiser = Realiser(None)
-    still, moved = (realiser.make(experiment, case, 0, load_estimators(["cone_axis"])) for case in cases)
-    assert not np.array_equal(still.frame, moved.frame)
-    for made in (still, moved):
-        (truth,) = made.truths
-        assert truth.bp_px == pytest.approx(still.truths[0].bp_px, abs=1e-9)
-        assert made.rows[0]["camera.motion.velocity_mm_s.1"] in (0.0, 25.0)
-
-
-@pytest.mark.parametrize(
-    ("motion", "words"),
-    [
-        ({"velocity_mm_s": [1.0, 2.0]}, "camera.motion.velocity_mm_s.2: missing"),
-        ({"velocity_mm_s": [1e9, 0, 0]}, "camera.motion.velocity_mm_s.0 = 1000000000.0"),
-        ({"angular_velocity_deg_s": "fast"}, "camera.motion.angular_velocity_deg_s = 'fast'"),
-        ({"exposure_s": 0}, "camera.motion.exposure_s = 0"),
-        ({"steps": 1}, "camera.motion.steps = 1"),
-        ({"speed": 1}, "camera.motion.speed = 1: unknown key"),
-    ],
-)
-def test_bad_motions_are_named_in_one_line(motion, words):
-    with pytest.raises(InputError) as caught:
-        scene(motion=motion)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_camera_that_enters_the_wall_is_refused_and_the_session_stays():

@@ -1,4 +1,6 @@
-"""Stages of the camera chain behind the lens, each against a plain reference or a closed form."""
+"""The camera chain by plain references and closed forms: its stages, their order, and the noise behind all of them."""
+
+import itertools
 
 import numpy as np
 import pytest
@@ -6,11 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage, stats
 
+from simtest.calibration import Response
 from simtest.errors import InputError
+from simtest.geometry import Camera
+from simtest.rendering import Session
 from simtest.simulation import sensor as camera_chain
-from simtest.simulation.frame import make_frame
+from simtest.simulation.frame import make_frame, render_view
+from simtest.simulation.highlights import examine
+from simtest.simulation.sensor import capture, noise_at
+from simtest.spec import load_scene
 from simtest.spec.scene import scene_from_dict
 from simtest.spec.sensor import (
+    PRESETS,
     Box,
     Caption,
     H264Coding,
@@ -21,6 +30,7 @@ from simtest.spec.sensor import (
     Sensor,
     Sharpening,
 )
+from tests.refusals import refused
 
 PATTERNS = ("rggb", "bggr", "grbg", "gbrg")
 
@@ -34,6 +44,54 @@ def picture(shape=(48, 64, 3), seed=0, smooth=2.0):
 
 def sensor(**keys):
     return Sensor.model_validate(keys)
+
+
+# Lens and noise -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sigma", [0.6, 4.0])
+def test_the_point_spread_is_scipys_gaussian(sigma):
+    radiance = np.random.default_rng(0).exponential(1.0, (50, 60, 3)).astype(np.float32)
+    found = camera_chain.collect(radiance, Sensor(point_spread_px=sigma), Camera(60, 50, 60.0, 60.0, 30.0, 25.0))
+    # OpenCV takes the Gaussian of floats out to 4 sigma, and mirrors the frame at its border.
+    radius = (round(sigma * 4 * 2 + 1) | 1) // 2
+    expected = ndimage.gaussian_filter(radiance.astype(float), (sigma, sigma, 0), radius=(radius, radius, 0))
+    np.testing.assert_allclose(found, expected, rtol=2e-6, atol=2e-6)
+
+
+class Normals:
+    """Draws numbers that are given, one after the other."""
+
+    def __init__(self, numbers):
+        self.numbers = numbers
+
+    def standard_normal(self, size, dtype):
+        given, self.numbers = np.split(self.numbers, [size])
+        return given.astype(dtype)
+
+
+@pytest.mark.parametrize("mean", [camera_chain.LEAST_MEAN, 400.0, 8000.0])
+def test_electrons_are_the_poisson_quantiles_of_normal_numbers(mean):
+    """But for a share, where a sum in single precision ends on the other side of a whole number."""
+    shares = (np.arange(50_000) + 0.5) / 50_000
+    found = camera_chain.poisson(np.full(shares.size, mean, np.float32), Normals(stats.norm.ppf(shares)))
+    gap = found - stats.poisson.ppf(shares, mean)
+    assert np.abs(gap).max() <= 1
+    assert np.count_nonzero(gap) < 6e-4 * shares.size
+
+
+def test_pixels_of_one_picture_have_numbers_of_their_own():
+    mean = np.repeat(np.float32([0.0, 10.0, 100.0, 1e9]), 5000)
+    numbers = camera_chain.poisson(mean, np.random.default_rng(0))
+    np.testing.assert_array_equal(numbers, camera_chain.poisson(mean, np.random.default_rng(0)))
+    assert not np.array_equal(numbers, camera_chain.poisson(mean, np.random.default_rng(1)))
+    for first, level in zip(range(0, 20000, 5000), [0.0, 10.0, 100.0, 1e9], strict=True):
+        own = numbers[first : first + 5000].astype(float)
+        assert own.mean() == pytest.approx(level, abs=5 * np.sqrt(level / 5000))
+    # A pixel that darkens changes no other that is bright.
+    darker = mean.copy()
+    darker[-1] = 5.0
+    np.testing.assert_array_equal(camera_chain.poisson(darker, np.random.default_rng(0))[5000:-1], numbers[5000:-1])
 
 
 # Mosaic ---------------------------------------------------------------------------------------------------------------
@@ -80,8 +138,10 @@ def edge_aware(plane, pattern):
     return filled
 
 
-@pytest.mark.parametrize("pattern", PATTERNS)
-@pytest.mark.parametrize(("method", "reference"), [("bilinear", bilinear), ("edge_aware", edge_aware)])
+@pytest.mark.parametrize(
+    ("pattern", "method", "reference"),
+    zip(PATTERNS, ("bilinear", "edge_aware") * 2, (bilinear, edge_aware) * 2, strict=True),
+)
 def test_demosaicing_equals_a_plain_reference_to_rounding(pattern, method, reference):
     spec = Mosaic(pattern=pattern, demosaicing=method)
     plane = camera_chain.behind_filters(picture((24, 30, 3), smooth=1.0), spec)
@@ -155,35 +215,11 @@ def test_colour_processing_undoes_the_sensors_colours():
     assert found.dtype == np.float32
 
 
-def test_white_stays_white_and_a_large_gain_is_noisy():
-    white = np.full((200, 200, 3), 0.5, np.float32)
-    told = sensor(colour={"white_balance": [4.0, 1.0, 1.0]}, full_well=5000)
-    found = camera_chain.capture(white, 1.0, told, np.random.default_rng(0))
-    assert found.mean(axis=(0, 1)) == pytest.approx([0.5] * 3, rel=2e-3)
-    # A quarter of the light: the variance of the value grows fourfold.
-    ratio = found[..., 0].var() / found[..., 1].var()
-    assert ratio == pytest.approx(4.0, rel=0.06)
-
-
 def test_a_highlight_of_a_tinted_sensor_is_white():
     """Behind gains of at least 1 a pixel that fills all wells is white, whatever the gains."""
     bright = np.full((8, 8, 3), 50.0, np.float32)
     found = camera_chain.capture(bright, 1.0, sensor(colour=WARM, saturation=True), None)
     np.testing.assert_allclose(found, 1.0, atol=2e-7)
-
-
-@pytest.mark.parametrize(
-    ("colour", "words"),
-    [
-        ({"matrix": [[1, 0, 0], [1, 0, 0], [0, 0, 1]]}, "must be invertible"),
-        ({"matrix": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "white stays white"),
-        ({"white_balance": [0, 1, 1]}, "white_balance"),
-    ],
-)
-def test_bad_colours_are_named(colour, words):
-    with pytest.raises(InputError, match=words) as caught:
-        scene_from_dict({"surface": {"type": "plane"}, "sensor": {"colour": colour}})
-    assert "\n" not in str(caught.value)
 
 
 # Detail ---------------------------------------------------------------------------------------------------------------
@@ -200,18 +236,6 @@ def test_sharpening_equals_direct_convolution():
     np.testing.assert_allclose(found, frame + (0.9 * (value - smooth))[..., None], atol=2e-6)
 
 
-@pytest.mark.parametrize("amount", [0.0, 0.5, 1.5])
-def test_halo_of_a_step_has_its_closed_form(amount):
-    """Beside a step of height h the sharpened value undershoots by amount h (1 - Phi(1/2 / sigma)): the dark halo."""
-    low, high, sigma = 0.3, 0.8, 2.0
-    edge = np.where(np.arange(64) < 32, low, high).astype(np.float32)
-    frame = np.repeat(edge[None, :], 16, axis=0)
-    found = camera_chain.sharpen(frame, Sharpening(radius_px=sigma, amount=amount))
-    depth = low - found[8, 31]
-    assert depth == pytest.approx(amount * (high - low) * stats.norm.sf(0.5 / sigma), abs=2e-3)
-    assert (depth > 0.01) == (amount > 0)
-
-
 @given(st.floats(0.3, 0.95), st.sampled_from(["linear", "cubic", "area", "lanczos"]))
 @settings(max_examples=20, deadline=None)
 def test_scaling_keeps_size_and_mean_and_loses_detail(factor, method):
@@ -222,11 +246,30 @@ def test_scaling_keeps_size_and_mean_and_loses_detail(factor, method):
     assert np.abs(np.diff(found)).mean() < np.abs(np.diff(frame)).mean()
 
 
-def test_scaling_by_half_averages_areas():
-    frame = picture((32, 48), smooth=0.5)
-    found = camera_chain.rescale(frame, Scaling(factor=0.5, method="area"))
-    halves = frame.reshape(16, 2, 24, 2).mean(axis=(1, 3))
-    np.testing.assert_allclose(found, halves.repeat(2, axis=0).repeat(2, axis=1), atol=1e-6)
+def overlaps(size, count):
+    """Return the matrix that averages `size` pixels to `count`, by how much of each the new ones cover."""
+    ends = np.arange(count + 1) * size / count
+    covered = np.minimum(ends[1:, None], np.arange(1, size + 1)) - np.maximum(ends[:-1, None], np.arange(size))
+    return np.maximum(covered, 0) * count / size
+
+
+def between(size, count):
+    """Return the matrix of linear interpolation from `size` pixels to `count`, about the pixels' centres."""
+    at = np.clip((np.arange(count) + 0.5) * size / count - 0.5, 0, size - 1)
+    return np.maximum(1 - np.abs(at[:, None] - np.arange(size)), 0)
+
+
+@pytest.mark.parametrize("factor", [0.6, 2.0])
+def test_scaling_equals_plain_matrices(factor):
+    """Smaller: areas are averaged, then lines are drawn between the centres; larger: the other way round."""
+    frame = np.random.default_rng(0).uniform(0, 1, (30, 48)).astype(np.float32)
+    found = camera_chain.rescale(frame, Scaling(factor=factor, method="linear"))
+    there, back = (overlaps, between) if factor < 1 else (between, overlaps)
+    expected = frame
+    for _ in range(2):
+        size = len(expected)
+        expected = (back(round(size * factor), size) @ there(size, round(size * factor)) @ expected).T
+    np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
 # Graphics -------------------------------------------------------------------------------------------------------------
@@ -251,6 +294,14 @@ def test_overlay_blanks_paints_and_writes():
     untouched[70:95, 55:] = False
     assert (found[untouched] == np.float32(0.4)).all()
     assert (frame == np.float32(0.4)).all()
+
+
+@pytest.mark.parametrize("height", [8.0, 40.0])
+def test_captions_have_the_asked_height(height):
+    overlay = Overlay(captions=(Caption(text="H", x=0.1, y=0.8, height_px=height),))
+    found = camera_chain.draw(np.zeros((100, 100), np.float32), overlay, None)
+    rows = np.nonzero(found.max(axis=1) > 0.5)[0]
+    assert np.ptp(rows) + 1 == pytest.approx(height, abs=1)
 
 
 def test_overlay_of_a_grey_picture_takes_the_lumas():
@@ -305,12 +356,18 @@ def test_a_missing_codec_is_named(monkeypatch):
         make_frame(scene_from_dict(told))
 
 
-def test_coding_needs_8_bits():
-    with pytest.raises(InputError, match=r"sensor: bits = None: must be 8 where coding is given"):
-        scene_from_dict({"surface": {"type": "plane"}, "sensor": {"coding": {"type": "jpeg"}}})
-
-
 # Exposure and the whole -----------------------------------------------------------------------------------------------
+
+CURVES = [Response("srgb"), Response("gamma", 2.2), Response("table", light=(0, 0.2, 1), value=(0, 0.5, 1)), Response()]
+
+
+@pytest.mark.parametrize("curve", CURVES, ids=lambda curve: curve.kind)
+def test_the_fast_curve_is_the_curve(curve):
+    light = np.random.default_rng(0).uniform(0, 1, (5, 6, 3)).astype(np.float32)
+    light.ravel()[:4] = 0.0, 1.0, 0.0031308, 1e-6
+    found = curve.encode_picture(light)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, curve.encode(light), atol=3e-7)
 
 
 @given(st.floats(0.1, 0.7), st.sampled_from(["linear", "srgb"]), st.floats(1e-6, 1e6))
@@ -325,15 +382,19 @@ def test_automatic_exposure_reaches_its_mean(average, response, unit):
     assert (frame[10:14, 10:14] == 1).all()
 
 
-def test_brighter_highlights_leave_the_tissue_at_its_level():
-    light = 0.2 + 0.1 * picture((60, 80))
-    told = sensor(response={"type": "srgb"})
-    levels = []
-    for peak in (3.0, 300.0):
-        light[5:9, 5:9] = peak
-        scale = camera_chain.full_scale_of_average(light, 0.4, told)
-        levels.append(float(np.median(camera_chain.capture(light, scale, told, None))))
-    assert levels[0] == pytest.approx(levels[1], abs=0.005)
+@given(st.floats(-9, 9), st.floats(0.2, 5.0))
+@settings(max_examples=40, deadline=None)
+def test_a_zero_is_found_in_few_steps(zero, power):
+    asked = []
+
+    def falling(x):
+        asked.append(x)
+        return float(np.exp(-power * x) - np.exp(-power * zero)) if power > 1 else -np.arctan(power * (x - zero))
+
+    assert camera_chain._zero_of(falling, -10.0, 10.0) == pytest.approx(zero, abs=2e-7)
+    assert len(asked) < 60
+    assert camera_chain._zero_of(lambda x: 1.0 - x, 2.0, 3.0) == 2.0
+    assert camera_chain._zero_of(lambda x: 9.0 - x, 2.0, 3.0) == 3.0
 
 
 @pytest.mark.parametrize("shape", [(60, 80), (60, 80, 3)])
@@ -371,9 +432,100 @@ def test_stages_come_in_physical_order():
     assert found.dtype == np.float32
 
 
-@pytest.mark.parametrize("height", [8.0, 12.0, 20.0, 40.0])
-def test_captions_have_the_asked_height(height):
-    overlay = Overlay(captions=(Caption(text="H", x=0.1, y=0.8, height_px=height),))
-    found = camera_chain.draw(np.zeros((100, 100), np.float32), overlay, None)
-    rows = np.nonzero(found.max(axis=1) > 0.5)[0]
-    assert np.ptp(rows) + 1 == pytest.approx(height, abs=1)
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"colour": {"matrix": [[1, 0, 0], [1, 0, 0], [0, 0, 1]]}}, "must be invertible"),
+        ({"colour": {"matrix": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}}, "white stays white"),
+        ({"coding": {"type": "jpeg"}}, "sensor: bits = None: must be 8 where coding is given"),
+    ],
+)
+def test_stages_that_do_not_fit_are_named(keys, words):
+    refused(lambda: scene_from_dict({"surface": {"type": "plane"}, "sensor": keys}), words)
+
+
+# The noise behind the whole chain, at highlights' peaks ---------------------------------------------------------------
+
+
+SCENE = {
+    "camera.width": 120, "camera.height": 90, "camera.fx": 110.0, "camera.fy": 110.0, "surface.radius_mm": 40.0,
+    "reflectance.exponent": 60.0, "reflectance.diffuse": 0.4,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def session():
+    return Session(load_scene("sphere", SCENE), "llvm_ad_rgb")
+
+
+def drawn_sigma(view, row, column, draws=150):
+    """The deviation of the channels' mean over draws of the whole frame, mean of the variances of 3 x 3 pixels."""
+    decode = view.scene.sensor.response.model().decode
+    around = np.s_[row - 1 : row + 2, column - 1 : column + 2]
+    values = np.stack([decode(view.frame(seed))[around] for seed in range(draws)])
+    values = values if values.ndim == 3 else values.mean(axis=3)
+    return np.sqrt(values.var(axis=0, ddof=1).mean()) * view.full_scale
+
+
+COLOURS = ((0.9, 0.4, 0.3), (1.0, 1.0, 1.0))
+SENSORS = {name: {"preset": name} for name in PRESETS} | {
+    "plain": {"full_well": 4000.0, "read_noise": 5.0},
+    "mosaic": {"full_well": 4000.0, "mosaic": {}, "colour": {"white_balance": [1.8, 1.0, 2.2]}},
+}
+
+
+@pytest.mark.render
+@pytest.mark.parametrize(("name", "colour"), zip(SENSORS, itertools.cycle(COLOURS)))
+def test_the_noise_at_a_peak_is_that_of_frames_drawn_again(name, colour, session):
+    sensor = {**SENSORS[name], "exposure": {"percentile": 100.0, "gain": 0.5}}
+    scene = load_scene("sphere", {**SCENE, "reflectance.colour": list(colour), "sensor": sensor})
+    view = render_view(session, scene)
+    light = view.light.mean(axis=2)
+    row, column = np.unravel_index(light.argmax(), light.shape)
+    found = noise_at(view.light, view.full_scale, scene.sensor, np.array([row]), np.array([column]), 64)
+    assert found[0] == pytest.approx(drawn_sigma(view, row, column), rel=0.15)
+    [highlight] = view.highlights
+    [examined] = examine(view.highlights, light)
+    assert highlight.peak_snr == pytest.approx(examined.height / found[0], rel=0.2)
+
+
+def test_without_light_there_is_no_noise():
+    sensor = Sensor(preset="old_sd")
+    assert noise_at(np.zeros((40, 40)), 0.0, sensor, np.array([3]), np.array([3]), 4) == [0.0]
+    assert noise_at(np.ones((40, 40)), 1.0, sensor, np.array([], int), np.array([], int), 4).shape == (0,)
+    # At the border, and in more pictures than one.
+    border = np.zeros(300, dtype=int), np.full(300, 39)
+    assert (noise_at(np.full((40, 40), 0.3, np.float32), 1.0, sensor, *border, 8) > 0).all()
+
+
+def test_a_chain_that_draws_no_noise_has_that_of_its_steps():
+    sensor = Sensor(bits=8, scaling={"factor": 0.6}, sharpening={"amount": 1.0})
+    light = np.linspace(0.1, 0.9, 1600, dtype=np.float32).reshape(40, 40)
+    found = noise_at(light, 1.0, sensor, np.array([20]), np.array([20]), 8)
+    assert found == pytest.approx(1 / 255 / np.sqrt(12), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("factor", "coding"), [(0.45, None), (0.6, {"type": "jpeg", "quality": 85}), (1.5, {"type": "jpeg", "quality": 85})]
+)
+def test_scaling_a_small_highlight_is_no_noise(factor, coding):
+    # Each draw falls otherwise between the recorded pixels of a row of cells that were scaled as one picture.
+    sensor = Sensor(full_well=5000, scaling={"factor": factor}, coding=coding, bits=8 if coding else None)
+    at, (y, x) = np.arange(24, 200, 24), np.mgrid[:216, :216]
+    spots = sum(np.exp(-((x - i) ** 2 + (y - j) ** 2) / 3) for i in at for j in at)
+    light = (0.2 + 0.6 * spots).astype(np.float32)
+    rows, columns = (each.ravel() for each in np.meshgrid(at, at))
+    found = noise_at(light, 1.0, sensor, rows, columns, 32)
+    rng = np.random.default_rng(0)
+    variance = np.var([capture(light, 1.0, sensor, rng) for _ in range(40)], axis=0, ddof=1)
+    around = [
+        variance[row - 1 : row + 2, column - 1 : column + 2].mean() for row, column in zip(rows, columns, strict=True)
+    ]
+    assert np.median(found / np.sqrt(around)) == pytest.approx(1, abs=0.15)
+
+
+def test_a_clipped_channel_has_the_noise_below_the_clip():
+    light = np.full((40, 40, 3), [1.3, 0.5, 0.4], dtype=np.float32)
+    sensor = Sensor(full_well=5000, saturation=True, colour={})
+    found = noise_at(light, 1.0, sensor, np.array([20]), np.array([20]), 200)
+    assert found == pytest.approx(np.sqrt((1 + 0.5 + 0.4) / 5000) / 3, rel=0.15)

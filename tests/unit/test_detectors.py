@@ -1,4 +1,4 @@
-"""The built-in detectors find what the pipelines find, and hand on the frame that patches are cut from."""
+"""Detectors: what the pipelines find by them, the frame they hand on, faults of others' detectors, and names."""
 
 from dataclasses import replace
 
@@ -9,12 +9,14 @@ from simtest.calibration import NO_PRIORS, Calibration, Frame, NoiseModel, Respo
 from simtest.calibration.photometry import AngularProfile
 from simtest.detection import Detection, Detector, Region, load_detector, peak_shape
 from simtest.detection.colour import ColourDetector, colour
-from simtest.detection.detector import run_detector
+from simtest.detection.detector import DETECTORS, run_detector
 from simtest.detection.peaks import PeakDetector, peaks
 from simtest.errors import Failure, InputError
+from simtest.estimators.names import ESTIMATORS
 from simtest.geometry import Camera, Patch, ViewMask
 from simtest.reconstruction.options import complete
 from simtest.reconstruction.pipeline import reconstruct
+from simtest.runtime.resources import parse_model
 
 CAMERA = Camera(200, 160, 200.0, 200.0, 100.0, 80.0)
 CALIBRATIONS = {
@@ -57,8 +59,7 @@ def same_patches(detection, made):
 
 
 @pytest.mark.parametrize("name", list(CALIBRATIONS))
-@pytest.mark.parametrize("isolated", [True, False])
-@pytest.mark.parametrize("smoothing_px", [0.0, 2.0])
+@pytest.mark.parametrize(("isolated", "smoothing_px"), [(True, 2.0), (False, 0.0)])
 def test_peaks_are_those_of_the_pipeline(name, isolated, smoothing_px):
     calibration = CALIBRATIONS[name]
     frame = Frame(lobes(), calibration, smoothing_px)
@@ -69,8 +70,7 @@ def test_peaks_are_those_of_the_pipeline(name, isolated, smoothing_px):
     same_patches(found, made)
 
 
-@pytest.mark.parametrize("isolated", [True, False])
-@pytest.mark.parametrize("name", ["camera alone", "view mask"])
+@pytest.mark.parametrize(("name", "isolated"), [("camera alone", True), ("view mask", False)])
 def test_colour_is_that_of_the_pipeline(name, isolated):
     calibration = CALIBRATIONS[name]
     found = ColourDetector(isolated).detect(Frame(tissue(), complete(calibration, None), 1.0), calibration.camera)
@@ -142,7 +142,6 @@ def fails(frame):
     [
         (lambda frame: None, "returned a NoneType; must be a Detection"),
         (lambda frame: Detection((Region((0.5, 0, 9, 9), (3, 3), 1.0),), frame), "must be 4 integers x, y, w, h"),
-        (lambda frame: Detection((Region((0, 0, 9), (3, 3), 1.0),), frame), "must be 4 integers x, y, w, h"),
         (lambda frame: Detection((Region((0, 0, 9, 9), (3.5, 3), 1.0),), frame), "must be 2 integers column, row"),
         (lambda frame: Detection((Region((5, 5, 45, 45), (2, 2), 0.1),), frame), r"peak \(2, 2\): must lie in its box"),
         (lambda frame: Detection((Region((5, 5, 45, 45), (50, 9), 0.1),), frame), r"peak \(50, 9\): must lie in its"),
@@ -168,8 +167,72 @@ def test_a_detector_may_hand_on_other_light_of_a_grey_frame():
     assert not isinstance(spot.patch, Failure)
 
 
-@pytest.mark.parametrize("channels", [None, 1, 2, 4])
+@pytest.mark.parametrize("channels", [None, 2])
 def test_colour_takes_three_channels(channels):
     shape = (CAMERA.height, CAMERA.width) if channels is None else (CAMERA.height, CAMERA.width, channels)
     with pytest.raises(InputError, match=r"takes \(H, W, 3\)"):
         run_detector(colour, Frame(np.full(shape, 0.5, dtype=np.float32), Calibration(CAMERA), 1.0))
+
+
+# Names: what they mean, and which are refused -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "short"),
+    [
+        ("learned_spot:models/spots/model.onnx", "learned_spot_spots"),
+        ("learned_spot:wide net.onnx", "learned_spot_wide_net"),
+        ("learned_spot:C:\\nets\\a.onnx", "learned_spot_C_nets_a"),
+        ("my_package.core:/a/b.onnx", "my_package.core_b"),
+    ],
+)
+def test_a_network_is_named_by_what_runs_it_and_its_file(text, short):
+    assert parse_model(text).short == short
+
+
+@pytest.mark.parametrize("text", ["learned_spot", "package:learned_spot", "command: ./core a.onnx", "a.onnx",
+                                  "command:core.onnx", "learned_spot: a.onnx", ":a.onnx", "a b:c.onnx"])  # fmt: skip
+def test_other_names_are_no_networks(text):
+    assert parse_model(text) is None
+
+
+def test_a_detector_without_networks_refuses_a_file():
+    assert "colour" in DETECTORS.names()
+    with pytest.raises(InputError, match=r"detector 'colour:a.onnx': colour runs no network; must stand alone"):
+        load_detector("colour:a.onnx")
+
+
+# Names that several packages register ---------------------------------------------------------------------------------
+
+
+POINTS = {
+    "simtest.estimators": ("cone_axis", "json:loads"),
+    "simtest.detectors": ("peaks", "json:loads"),
+}
+
+
+def install(folder, name, monkeypatch):
+    """Make a package that registers names of simtest, in front of all others on the path."""
+    info = folder / f"{name.replace('-', '_')}-9.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 9.0\n")
+    text = "".join(f"[{group}]\n{point} = {value}\n" for group, (point, value) in POINTS.items())
+    (info / "entry_points.txt").write_text(text)
+    monkeypatch.syspath_prepend(str(folder))
+
+
+@pytest.mark.parametrize(("group", "name"), [(ESTIMATORS, "cone_axis"), (DETECTORS, "peaks")])
+def test_a_name_that_another_package_registers_too_is_refused(tmp_path, monkeypatch, group, name):
+    own = group.load(name)
+    install(tmp_path, "evil-core", monkeypatch)
+    with pytest.raises(InputError, match=rf"registered by 2 packages; name one of them: evil-core:{name} or simtest:"):
+        group.load(name)
+    assert group.load(f"simtest:{name}") is own
+
+
+@pytest.mark.parametrize("called", ["simtest", "SimTest"])
+@pytest.mark.parametrize(("group", "name"), [(ESTIMATORS, "cone_axis"), (DETECTORS, "peaks")])
+def test_a_package_of_our_name_is_refused(tmp_path, monkeypatch, group, name, called):
+    install(tmp_path, called, monkeypatch)
+    with pytest.raises(InputError, match="another package that is called simtest registers json:loads; remove it"):
+        group.load(name)

@@ -33,8 +33,7 @@ def patch_of(image, box=None, peak=None):
     return patch
 
 
-@pytest.mark.parametrize("box", [None, (5, 3, 80, 60), (11, 10, 60, 50)])
-@pytest.mark.parametrize("t", [0.3, 0.5, 0.7])
+@pytest.mark.parametrize(("box", "t"), [(None, 0.3), ((5, 3, 80, 60), 0.5), ((11, 10, 60, 50), 0.7)])
 def test_contour_of_a_radial_image_lies_where_the_formula_says(box, t):
     """A shift of half a pixel, or x and y exchanged, would be 20 times the tolerance or more."""
     image = spot()
@@ -50,14 +49,7 @@ def test_contour_of_a_radial_image_lies_where_the_formula_says(box, t):
     np.testing.assert_array_equal(points[0], points[-1])
 
 
-def test_x_is_the_column():
-    points = patch_of(spot(stretch=1.8)).isophote(0.5)
-    fitted = ellipse_of_conic(fit_ellipse(points[:-1]).image)
-    assert fitted.semi_major / fitted.semi_minor == pytest.approx(1.8, abs=1e-3)
-    assert abs(fitted.angle) < 1e-3
-
-
-@pytest.mark.parametrize("shift", np.linspace(0, 1, 6))
+@pytest.mark.parametrize("shift", [0.0, 0.3, 0.5, 0.9])
 def test_peak_is_found_between_pixels(shift):
     centre = CENTRE + np.array([shift, -0.7 * shift])
     patch = patch_of(spot(centre))
@@ -148,16 +140,6 @@ def encloses_all(polygon, points):
     return np.array([encloses(polygon, point) for point in points])
 
 
-def test_a_pixel_at_the_level_is_one_point():
-    """A plus of pixels: 8 points of the polygon, of which its 4 outer corners are crossed twice."""
-    image = np.zeros((7, 7), np.float32)
-    image[2:5, 2:5] = 0.5
-    image[3, 2:5] = image[2:5, 3] = 1.0
-    patch = patch_of(image)
-    polygon = patch.isophote(0.5)
-    assert len(patch.crossings(0.5)) == len(polygon) - 1 == 8
-
-
 @given(
     number=st.integers(0, 2**32 - 1), t=st.floats(0.2, 0.9), x=st.floats(5, 45), y=st.floats(5, 35),
     radius=st.floats(4, 40),
@@ -233,28 +215,10 @@ def test_what_has_no_peak_fails():
     assert isinstance(Patch.cut(holed, (0, 0, 30, 30)), Patch)
 
 
-@pytest.mark.parametrize("box", [(-1, 0, 5, 5), (0, 0, 0, 5), (0, 0, WIDTH + 1, 5), (0, HEIGHT, 1, 1)])
-def test_a_region_outside_the_frame_is_refused(box):
-    with pytest.raises(InputError, match="roi"):
-        Patch.cut(spot(), box)
-
-
 @pytest.mark.parametrize("t", [0.0, 1.0, -0.1, 2.0, float("nan")])
 def test_isovalues_outside_the_open_interval_are_refused(t):
     with pytest.raises(InputError, match="isovalue"):
         patch_of(spot()).isophote(t)
-
-
-def test_smoothing_keeps_the_place_and_adds_the_variances():
-    smoothed = smooth(spot(), 3.0)
-    patch = patch_of(smoothed)
-    np.testing.assert_allclose(patch.peak_px, CENTRE, atol=2e-3)
-    radius = np.sqrt((SIGMA**2 + 9) * -2 * np.log(0.5))
-    distance = np.linalg.norm(patch.isophote(0.5) - CENTRE, axis=1)
-    # 0.03: OpenCV cuts its kernel off at 4 standard deviations, and the peak is taken at a pixel's centre.
-    np.testing.assert_allclose(distance.mean(), radius, atol=0.03)
-    np.testing.assert_array_equal(smooth(spot(), 0), spot())
-    assert float(smoothed.sum()) == pytest.approx(float(spot().sum()), rel=1e-4)
 
 
 def test_even_odd_rule():

@@ -82,6 +82,17 @@ def film(tmp_path_factory):
     return render
 
 
+def with_poses(made, tmp_path, change):
+    """Return options whose file of poses holds those of `film`, each changed."""
+    folder, options = made
+    told = json.loads((folder / "poses.json").read_text())
+    for entry in told["frames"]:
+        entry["world_from_camera"] = change(np.array(entry["world_from_camera"])).tolist()
+    path = tmp_path / "poses.json"
+    path.write_text(json.dumps(told))
+    return folder / "frames", replace(options, poses=path)
+
+
 def shapes_in(folder):
     with (folder / "timeline.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -137,16 +148,15 @@ def test_a_picture_that_the_poses_do_not_name_is_passed_over(film, tmp_path):
 @pytest.mark.render
 def test_wrong_poses_tell_nothing_wrong(film, tmp_path):
     """Negative control: poses of the mirrored motion fit no curvature, or leave the signs open."""
-    folder, options = film("saddle")
-    table = json.loads((folder / "poses.json").read_text())
-    first = np.array(table["frames"][0]["world_from_camera"])
-    for entry in table["frames"]:
-        T = np.array(entry["world_from_camera"])
+    folder, _ = film("saddle")
+    first = np.array(json.loads((folder / "poses.json").read_text())["frames"][0]["world_from_camera"])
+
+    def mirrored(T):
         T[:3, 3] = 2 * first[:3, 3] - T[:3, 3]
-        entry["world_from_camera"] = T.tolist()
-    wrong = tmp_path / "poses.json"
-    wrong.write_text(json.dumps(table))
-    made = reconstruct_sequence(folder / "frames", tmp_path / "out", replace(options, poses=wrong))
+        return T
+
+    frames, wrong = with_poses(film("saddle"), tmp_path, mirrored)
+    made = reconstruct_sequence(frames, tmp_path / "out", wrong)
     bends, rows = shapes_in(tmp_path / "out")
     assert "4 fit no curvature" in made.motion
     assert made.motion.splitlines()[1:] == [
@@ -162,14 +172,8 @@ def test_wrong_poses_tell_nothing_wrong(film, tmp_path):
     ("factor", "told"), [(1e-3, "motions are 3e-05 to"), (1e3, "of the distance, and 0.002 to 0.2")]
 )
 def test_poses_in_the_wrong_unit_are_told(film, tmp_path, factor, told):
-    folder, options = film("convex")
-    table = json.loads((folder / "poses.json").read_text())
-    for entry in table["frames"]:
-        for row in entry["world_from_camera"][:3]:
-            row[3] *= factor
-    wrong = tmp_path / "poses.json"
-    wrong.write_text(json.dumps(table))
-    made = reconstruct_sequence(folder / "frames", tmp_path / "out", replace(options, poses=wrong))
+    frames, wrong = with_poses(film("convex"), tmp_path, lambda T: np.block([[T[:3, :3], factor * T[:3, 3:]], [T[3:]]]))
+    made = reconstruct_sequence(frames, tmp_path / "out", wrong)
     (line,) = made.motion.splitlines()[1:]
     assert told in line
     assert line.endswith("are needed: is the unit of the poses right?")
@@ -179,13 +183,8 @@ def test_poses_in_the_wrong_unit_are_told(film, tmp_path, factor, told):
 @pytest.mark.parametrize("name", list(SHAPES))
 def test_poses_with_the_axes_of_opengl_are_told(film, tmp_path, name):
     """On right poses, `test_a_sequence_with_poses_tells_the_shape` asserts that nothing is said."""
-    folder, options = film("saddle")
-    table = json.loads((folder / "poses.json").read_text())
-    for entry in table["frames"]:
-        entry["world_from_camera"] = (np.array(entry["world_from_camera"]) @ np.diag([1.0, -1, -1, 1])).tolist()
-    wrong = tmp_path / "poses.json"
-    wrong.write_text(json.dumps(table))
-    made = reconstruct_sequence(folder / "frames", tmp_path / "out", replace(options, poses=wrong))
+    frames, wrong = with_poses(film(name), tmp_path, lambda T: T @ np.diag([1.0, -1, -1, 1]))
+    made = reconstruct_sequence(frames, tmp_path / "out", wrong)
     assert "fit clearly better with y and z of the camera reversed" in made.motion.splitlines()[1]
 
 

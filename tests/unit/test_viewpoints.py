@@ -30,13 +30,13 @@ def make(name, viewpoint):
 
 @pytest.mark.parametrize("name", SURFACES)
 def test_poses_are_rigid_repeatable_and_different(name):
-    poses = [make(name, viewpoint).model_from_camera for viewpoint in range(5)]
+    poses = [make(name, viewpoint).model_from_camera for viewpoint in range(3)]
     for viewpoint, pose in enumerate(poses):
         np.testing.assert_array_equal(pose, make(name, viewpoint).model_from_camera)
         np.testing.assert_allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-12)
         assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
         np.testing.assert_array_equal(pose[3], [0, 0, 0, 1])
-    assert len({pose.tobytes() for pose in poses}) == 5
+    assert len({pose.tobytes() for pose in poses}) == 3
 
 
 @pytest.mark.parametrize(
