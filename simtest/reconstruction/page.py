@@ -66,6 +66,7 @@ def write_picture_page(path: Path, spots: Specularities, picture: Image) -> None
     clouds = any(each.cloud is not None for spot in spots for each in spot.normals.values())
     write_page(
         path, "picture.html.j2", data, record=spots, stated=stated, organ=spots.stated_of_organ,
+        rule=spots.sightline_rule, rule_note=spots.rule_note,
         told=list(parts.items()), picture=_address(picture),
         title=Path(spots.image).name, width=width, height=height, palette=palette, best=best,
         answered=sum(best.values()), clouds=clouds, terms=explanations.TERMS,

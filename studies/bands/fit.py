@@ -1,4 +1,4 @@
-"""Bands of glitter by maximum quasi-likelihood: a flat background and gaussian rates of glinting pixels (8.3, 8.9).
+"""Bands of glitter by maximum quasi-likelihood: a flat background and gaussian rates of glinting pixels.
 
 The share of glinting pixels is lambda = b + sum_k A_k exp(-|t|^2 / 2), t = v + T(v, v) / 2, v = L (u - u0): u are
 angles in the plane across a band's centre, L its inverse extent, and T the gradient of a symmetric cubic, since the

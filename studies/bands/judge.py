@@ -1,4 +1,4 @@
-"""Which bands carry the organ's normal, how wide its region is, and why others are refused (8.6, 8.9)."""
+"""Which bands carry the organ's normal, how wide its region is, and why others are refused."""
 
 import math
 from dataclasses import dataclass
@@ -10,16 +10,16 @@ from simtest.estimators.cloud import evidence_of
 from simtest.estimators.cloud_light import DiffuseLight
 from simtest.estimators.cloud_mixture import Cloud
 from simtest.estimators.prior_parts import light_offset_part
-from simtest.geometry.vectors import bisect
+from simtest.geometry.vectors import basis_across, bisect
 from simtest.runtime.arrays import Array
 from studies.bands.cells import Cells
 from studies.bands.fit import Band, Fit
 
 SLOPES_RAD = np.radians([3.0, 5.0, 8.0, 12.0, 17.0, 20.0])
-"""The slopes' width is a prior: one frame hardly tells it (8.6b)."""
+"""The slopes' width is a prior: one frame hardly tells it."""
 
 CHANGING = 0.35
-"""Turn of the centre by curvature that changes, over the slopes' width (8.9)."""
+"""Turn of the centre by curvature that changes, over the slopes' width."""
 
 REGION = 3.0
 """Squared radius of the 95 % region over the mean square of the error."""
@@ -61,12 +61,17 @@ def _normal(band: Band, priors: Priors) -> Array:
 
 
 def _radius(band: Band, strongest: float, priors: Priors) -> float:
-    """Return the radius of the 95 % region: the slopes' width is a prior, its parts as of 8.9."""
+    """Return the radius of the 95 % region: the slopes' width is a prior."""
     Z = band.L @ band.covariance @ band.L.T
     share = float(np.trace(Z)) + 2 * CHANGING**2 + 2 * max(0.0, math.log(strongest / band.amplitude))
     # The curvature is not told apart from the slopes: a narrow band's slopes are narrow, or its curvature is strong.
     slope = min(float(np.sqrt(np.mean(SLOPES_RAD**2))), 1.5 * float(band.extents.max()))
-    untold = 0.0 if len(priors.lights) else float(np.trace(light_offset_part(-band.centre, priors)))
+    if len(lights := priors.lights):
+        # Which of several lights made a band is not told.
+        halves = lights @ basis_across(band.centre).T / (2 * priors.distance.mean)
+        untold = float(halves.var(axis=0).sum())
+    else:
+        untold = float(np.trace(light_offset_part(-band.centre, priors)))
     return math.sqrt(REGION * (slope**2 * share + untold))
 
 

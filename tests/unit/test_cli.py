@@ -709,7 +709,7 @@ def test_a_command_prints_the_record_that_it_returns(capsys):
 class Spots(list):
     """Specularities without an estimate or a reference: two of three isolated, the others clusters."""
 
-    reference = None
+    reference, sightline_rule = None, ()
 
     def __init__(self, count):
         super().__init__(
