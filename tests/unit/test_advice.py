@@ -274,6 +274,16 @@ def test_spots_shrink_with_relief_and_have_the_smooth_size_without():
     assert smooth.shapeless_beyond_mm == math.inf
 
 
+@pytest.mark.parametrize(("slope", "wavelength"), [(6.0, 2.0), ((4.0, 8.0), (1.0, 3.0))])
+def test_a_typical_glint_bends_by_slope_times_wave_number_of_the_middle_relief(slope, wavelength):
+    scope = replace(read_scope("colonoscope_2"), relief=ReliefPrior(slope_deg=slope, wavelength_mm=wavelength))
+    question = Question(scope, "colon")
+    told = spot_size(question)
+    bend = math.radians(6.0) * 2 * math.pi / 2.0
+    assert question.middle_mm * bend > 1
+    assert told.smooth_px / told.relief_px == pytest.approx(question.middle_mm * bend, rel=1e-9)
+
+
 @pytest.mark.parametrize(("asked", "planned"), [(8, 8), (12, 16), (20, 24), (40, 40)])
 def test_at_least_the_frames_that_are_asked_for_are_planned(asked, planned):
     question = Question(read_scope("laparoscope"), "plane", (20.0, 60.0), frames=asked)

@@ -13,7 +13,7 @@ from simtest.errors import Failure, Reason
 from simtest.estimators.cloud import CloudCentre, cloud, small_sample
 from simtest.estimators.cloud_light import find_spots
 from simtest.estimators.cloud_mixture import fit_mixture, sampling_covariance, window_of
-from simtest.estimators.cloud_shape import slope_of
+from simtest.estimators.cloud_shape import CloudShape, slope_of
 from simtest.estimators.dispatch import run_in_frame
 from simtest.estimators.protocol import CloudEstimator
 from simtest.geometry import Camera
@@ -336,3 +336,10 @@ def test_same_frame_same_answer():
     points = spread_points(np.random.default_rng(5), 24)
     first, second = (reconstruct(picture_of(points), CAMERA, {"cloud": cloud})[-1] for _ in range(2))
     assert np.array_equal(first.estimates["cloud"].normal, second.estimates["cloud"].normal)
+
+
+def test_the_axis_ratio_is_that_of_the_extents():
+    R = np.array([[0.8, -0.6], [0.6, 0.8]])
+    covariance = R @ np.diag([0.02**2, 0.05**2]) @ R.T
+    shape = CloudShape(np.zeros((9, 2)), covariance, 9.0, 1.0, exactly(1e-9), slope_of(covariance, 9.0, exactly(1e-9)))
+    assert shape.axis_ratio == pytest.approx(0.4, rel=1e-9)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 import simtest
 from simtest.errors import InputError
@@ -365,3 +366,11 @@ def test_export_and_bounces_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"render.path_depth = 3: .* must be 2 where instruments are present"):
         described(SHAFT, render={"path_depth": 3})
     assert described({**SHAFT, "present": False}, render={"path_depth": 3}).instruments
+
+
+@pytest.mark.parametrize(("azimuth", "tilt", "roll"), [(30.0, 20.0, 40.0), (200.0, -10.0, 90.0), (75.0, 45.0, -60.0)])
+def test_a_grasper_rolls_right_handed_about_its_shaft(azimuth, tilt, roll):
+    held = {"kind": "grasper", "azimuth_deg": azimuth, "tilt_deg": tilt}
+    level, turned = (Instrument(**held, roll_deg=each) for each in (0.0, roll))
+    expected = Rotation.from_rotvec(np.radians(roll) * level.back).apply(level.side)
+    np.testing.assert_allclose(turned.side, expected, atol=1e-12)

@@ -1,5 +1,7 @@
 """What isophotes show of their own errors: noise carried through smoothing, ripples as drawn, bends of melted ones."""
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from simtest.estimators.budget import (
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
 from simtest.estimators.family import OF_MEAN, OF_PEAK, fit_isophote_family
+from simtest.estimators.isophotes import IsophotesAcross
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import tangent_coordinates
 from simtest.runtime import chi_squared
@@ -198,3 +201,14 @@ def test_raw_pixels_move_what_smoothed_pixels_move(kind):
     each = (smoothed @ moves.T) * np.broadcast_to(noise, (SIZE, SIZE)).ravel()[near, None]
     wanted = each.T @ each
     assert np.abs(found - wanted).max() < (5e-3 if kind == "one number" else 0.02) * np.abs(wanted).max()
+
+
+@pytest.mark.parametrize(("square", "expected"), [(1.0, True), (-1.0, False)])
+@pytest.mark.parametrize("centre", [(0.1, -0.2), (1.0, 2.0), (-3.0, 0.5)])
+def test_ellipses_are_told_from_those_without_a_real_point(centre, square, expected):
+    """(x - m)^T A (x - m) = square has real points where A and the square are positive, wherever it lies."""
+    A, m = np.array([[0.6, 0.25], [0.25, 1.1]]), np.array(centre)
+    right = square - m @ A @ m
+    a, b, c, d, e = np.array([A[0, 0], 2 * A[0, 1], A[1, 1], *(-2 * A @ m)]) / right
+    given = SimpleNamespace(conics=np.array([[a, b, c, d, e], [1.0, 3.0, 1.0, 0.0, 0.0]]))
+    assert IsophotesAcross.are_ellipses.func(given).tolist() == [expected, False]

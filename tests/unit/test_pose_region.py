@@ -72,3 +72,16 @@ def test_wider_confidence_holds_more():
 def test_conic_and_ellipse_are_inverse():
     conic = np.array([90.0, 12, 60, 3, -2])
     np.testing.assert_allclose(_conic(_ellipse(conic)), conic, rtol=1e-10)
+
+
+@pytest.mark.parametrize("azimuth_deg", [25.0, 110.0, 250.0])
+def test_members_of_cones_turned_about_their_axis_lie_at_zero(azimuth_deg):
+    """Then all of the conic's five parameters count, the mixed ones too."""
+    (a, b, c, d, e), N = circle_cone(np.radians(30.0))
+    s, t = np.sin(np.radians(azimuth_deg)), np.cos(np.radians(azimuth_deg))
+    R = np.array([[t, -s, 0.0], [s, t, 0.0], [0.0, 0.0, 1.0]])
+    C = R @ np.array([[a, b / 2, d / 2], [b / 2, c, e / 2], [d / 2, e / 2, -1.0]]) @ R.T
+    conic = np.array([C[0, 0], 2 * C[0, 1], C[1, 1], 2 * C[0, 2], 2 * C[1, 2]])
+    region = PoseRegion(FRAME, conic, np.diag(1e-4 * conic**2 + 1e-3))
+    assert region.statistic(R @ N @ FRAME) == pytest.approx(0, abs=1e-9)
+    assert region.statistic(R.T @ N @ FRAME) > 10

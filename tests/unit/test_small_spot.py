@@ -18,7 +18,13 @@ from simtest.estimators.curved import curved
 from simtest.estimators.family import fit_isophote_family
 from simtest.estimators.highlight import fit_highlights
 from simtest.estimators.photometric import photometric
-from simtest.estimators.small_spots import fit_small_spots, is_small, radius_before_smoothing_px
+from simtest.estimators.small_spots import (
+    SpotWindows,
+    fit_small_spots,
+    fit_spots,
+    is_small,
+    radius_before_smoothing_px,
+)
 from simtest.geometry import Camera, Patch
 from simtest.geometry.vectors import angle_deg
 
@@ -172,3 +178,16 @@ def test_what_is_fitted_is_kept_with_the_patch():
     assert first is again
     (of_copy,) = fit_highlights([replace(patch, others_px=((1.0, 2.0),))], CAMERA, ISOVALUES)
     assert of_copy is not first
+
+
+def test_the_residual_is_what_stands_off_the_spot():
+    """Of noise its standard deviation, each free pixel counted once."""
+    sigma, side = 0.02, np.arange(15) - 7.0
+    offsets = np.stack([axis.ravel() for axis in np.meshgrid(side, side)])
+    lobe = np.exp(-((offsets - 0.3) ** 2).sum(axis=0) / (2 * 2.0**2))
+    values = lobe + sigma * np.random.default_rng(5).standard_normal((40, len(lobe)))
+    none = np.zeros(values.shape, dtype=bool)
+    fits = fit_spots(SpotWindows(values, ~none, none, offsets), np.zeros((40, 2)), np.full(40, 4.0), np.zeros(40))
+    assert fits.sound.all()
+    # 40 windows of 218 free pixels: the mean of the variances is known to 1.5 %.
+    assert np.mean(fits.residual**2) == pytest.approx(sigma**2, rel=0.06)
