@@ -83,6 +83,19 @@ def roots_of(a, b, c):
 
 
 @pytest.mark.parametrize(("kind", "settings", "A"), ANALYTIC, ids=str)
+def test_faces_of_an_analytic_mesh_join_neighbours_and_look_as_their_corners_do(kind, settings, A):
+    del A
+    mesh = build(kind, **settings).mesh
+    corners, normals = mesh.vertices[mesh.faces], mesh.normals[mesh.faces].mean(axis=1)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(across, axis=1)
+    sound = area > 1e-9 * area.max()
+    assert sound.mean() > 0.9
+    assert (np.einsum("ni,ni->n", across, normals)[sound] > 0.8 * area[sound]).all()
+    assert np.array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))
+
+
+@pytest.mark.parametrize(("kind", "settings", "A"), ANALYTIC, ids=str)
 def test_analytic_points_normals_and_shape_operators_are_those_of_the_formula(kind, settings, A):
     """F = z + q A q / 2 grows towards the camera; N = grad F / |grad F|, S = P A P / |grad F| (Goldman 2005).
 
