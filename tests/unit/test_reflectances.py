@@ -33,7 +33,7 @@ from tests.lobe_formulas import (
 pytestmark = pytest.mark.render
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def mi():
     mi = backend.load()
     elements.register(mi.variant())
