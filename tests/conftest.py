@@ -54,6 +54,12 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+def pytest_runtest_teardown():
+    """Let no command that ran in this process say how much the next one tells."""
+    if (command_line := sys.modules.get("simtest.cli.main")) is not None:
+        command_line.MANNERS.quiet = command_line.MANNERS.verbose = False
+
+
 def largest_first(files):
     """Return files by their size: how long a file of tests takes is near enough, on 2 to 8 cores."""
     return sorted(files, key=lambda file: -file.stat().st_size)

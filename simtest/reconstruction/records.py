@@ -284,8 +284,8 @@ class Specularities(list[Specularity]):
         if not (rule := self.sightline_rule):
             return ""
         return (
-            f"{', '.join(rule[:-1])} and {rule[-1]} are one {SIGHTLINE_RULE} here: without a light they differ in "
-            "nothing but the pixel that they look at; simtest calibrate light finds the light"
+            f"Without a light {', '.join(rule[:-1])} and {rule[-1]} are one {SIGHTLINE_RULE}: they differ in nothing "
+            "but the pixel that they look at; simtest calibrate light finds the light"
         )
 
     @property

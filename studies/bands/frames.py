@@ -11,9 +11,10 @@ from simtest.calibration import Calibration
 from simtest.errors import SimtestError
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image, IntArray
-from simtest.runtime.files import write_atomically
 from simtest.simulation.frame import render_picture
-from simtest.spec import load_scene, scene_from_dict
+from simtest.spec import scene_from_dict
+from studies.clouds.frames import tissue_scene
+from studies.kept import write_arrays
 
 ORGANS = ("colon", "liver", "gallbladder")
 SLOPES_DEG = (3.0, 6.0, 10.0, 17.0)
@@ -60,13 +61,7 @@ class BaseFrame:
 
 def organ_scene(organ: str, slope_deg: float, seed: int) -> dict[str, object]:
     """Return a shipped tissue scene with its own rig, its relief scaled to a slope along one direction."""
-    told: dict[str, object] = {"surface.relief.seed": seed, "sensor.seed": seed, "render.samples_per_pixel": 4}
-    if organ != "gallbladder":
-        told["surface.viewpoint"] = seed
-    else:
-        rng = np.random.default_rng([seed, 3])
-        told |= {"surface.tilt_deg": float(rng.uniform(0, 25)), "surface.spin_deg": float(rng.uniform(0, 180))}
-    data = load_scene(f"tissue_{organ}", told).model_dump(mode="json")
+    data = tissue_scene(organ, seed)
     bands = data["surface"]["relief"]["bands"]
     scale = slope_deg / float(np.sqrt(sum(band["slope_deg"] ** 2 for band in bands)))
     finer = min(1.0, HIGHEST_MM / (HEIGHTS_MM[organ] * scale))
@@ -98,16 +93,10 @@ def load(data: dict[str, object], file: Path, session: Session | None) -> tuple[
     if not file.exists():
         arrays, session = _render(data, session)
         text = np.frombuffer(json.dumps(data).encode(), dtype=np.uint8)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, lambda part: _save(part, {**arrays, "data": text}))
+        write_arrays(file, {**arrays, "data": text})
     with np.load(file) as kept:
         arrays = {name: kept[name] for name in kept.files}
     return BaseFrame(json.loads(arrays.pop("data").tobytes()), **arrays), session
-
-
-def _save(path: Path, arrays: Mapping[str, Array]) -> None:
-    with path.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def _render(data: dict[str, object], session: Session | None) -> tuple[dict[str, Array], Session]:

@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,12 +12,11 @@ from simtest.calibration import Calibration
 from simtest.conventions import PIXEL_CENTRE
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image, IntArray
-from simtest.runtime.files import write_atomically
 from simtest.simulation.frame import render_picture
 from simtest.simulation.highlights import CloudRegions
 from simtest.spec import load_scene, scene_from_dict
 from simtest.spec.scene import Scene
-from studies.kept import of_this_code
+from studies.kept import of_this_code, write_arrays
 
 PICTURE_TABLE = ((3.0, 1.5), (6.0, 1.5), (6.0, 3.0))
 """Slope, deg, and wavelength, mm, of theory.md's table of clouds from a picture."""
@@ -144,15 +144,20 @@ def _smooth_base(
     )
 
 
-def tissue(organ: str, seed: int, two_lights: bool = False) -> Case:
-    """Return a case of a shipped tissue scene at a viewpoint of its own; its light at the camera, or its own rig."""
-    told = {"surface.relief.seed": seed, "sensor.seed": seed, "render.samples_per_pixel": 4}
+def tissue_scene(organ: str, seed: int) -> dict[str, Any]:
+    """Return a shipped tissue scene at a viewpoint of its own, with its own rig."""
+    told: dict[str, object] = {"surface.relief.seed": seed, "sensor.seed": seed, "render.samples_per_pixel": 4}
     if organ != "gallbladder":
         told["surface.viewpoint"] = seed
     else:
         rng = np.random.default_rng([seed, 3])
         told |= {"surface.tilt_deg": float(rng.uniform(0, 25)), "surface.spin_deg": float(rng.uniform(0, 180))}
-    data = load_scene(f"tissue_{organ}", told).model_dump(mode="json")
+    return load_scene(f"tissue_{organ}", told).model_dump(mode="json")
+
+
+def tissue(organ: str, seed: int, two_lights: bool = False) -> Case:
+    """Return a case of `tissue_scene`; its light at the camera, or its own rig."""
+    data = tissue_scene(organ, seed)
     if not two_lights:
         data["rig"] = {"lights": [{"source": {"type": "disc", "radius_mm": 0.9}}]}
     else:
@@ -168,18 +173,11 @@ def load(case: Case, folder: Path, session: Session | None) -> tuple[BaseFrame, 
         frame, session = _render(case, session)
         arrays = {name: value for name, value in vars(frame).items() if name != "case"}
         scene = np.frombuffer(json.dumps(case.data).encode(), dtype=np.uint8)
-        folder.mkdir(parents=True, exist_ok=True)
-        # An open file: given a path NumPy would append ".npz" to it.
-        write_atomically(file, lambda part: _save(part, {**arrays, "scene": scene}))
+        write_arrays(file, {**arrays, "scene": scene})
     with np.load(file) as kept:
         arrays = {name: kept[name] for name in kept.files}
     data = json.loads(arrays.pop("scene").tobytes())
     return BaseFrame(Case(case.group, case.seed, data), **arrays), session
-
-
-def _save(path: Path, arrays: Mapping[str, Array]) -> None:
-    with path.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def _render(case: Case, session: Session | None) -> tuple[BaseFrame, Session]:

@@ -404,10 +404,8 @@ def test_a_corrupt_record_starts_the_run_again(tmp_path, stopped):
 
 @pytest.fixture(autouse=True)
 def ordinary(monkeypatch):
-    """Leave no flags and no handler of warnings behind."""
+    """Leave no handler of warnings behind."""
     monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
-    monkeypatch.setattr(front.MANNERS, "quiet", False)
-    monkeypatch.setattr(front.MANNERS, "verbose", False)
 
 
 # Lists and completion --------------------------------------------------------------------------------------------

@@ -106,7 +106,7 @@ def test_estimators_that_are_the_reversed_sightline_are_one_row():
     assert rows == ["sightline rule"]
     assert spots.reference.rows["sightline rule"].mean_deg == spots[0].reference.errors[spots[0].best].error_deg
     assert set(spots.reference.estimators) == set(rule)
-    assert "are one sightline rule here" in spots.rule_note
+    assert "are one sightline rule: they differ" in spots.rule_note
 
 
 def test_with_a_light_beside_the_camera_each_estimator_has_its_row():

@@ -223,7 +223,7 @@ print(estimator.core._child.folder, flush=True)
 
 @contextmanager
 def parent(then, fault, mark):
-    """Give a process that holds a core, and the core's folder; at the end neither core nor folder may be left."""
+    """Yield a process that holds a core, and the core's folder; at the end neither core nor folder may be left."""
     line = [sys.executable, "-c", PARENT.format(then=then), command(BAD_CORE, fault, mark)]
     with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as started:
         folder = started.stdout.readline().strip()

@@ -23,9 +23,6 @@ def bars(monkeypatch):
 
     monkeypatch.setattr(rich, "Progress", Recorded)
     monkeypatch.setattr(progress, "at_terminal", lambda: True)
-    # A command that ran before in this process may have been quiet.
-    for manner in ("quiet", "verbose"):
-        monkeypatch.setattr(progress.MANNERS, manner, False)
     return made
 
 
