@@ -1,5 +1,7 @@
 """What every estimator of highlights must do: turn and mirror with the picture, and not depend on how bright it is."""
 
+from importlib.metadata import entry_points
+
 import numpy as np
 import pytest
 
@@ -13,7 +15,16 @@ from simtest.geometry import BrownConrady, Camera, Patch, smooth
 from simtest.geometry.vectors import angle_deg, basis_across
 from simtest.validation.paper.plane_from_aside import photometric_plane
 
-NAMES = ("cone_axis", "curved", "brightest_point", "photometric", "bisector", "circle_pose")
+ELSEWHERE = {"cloud", "inverse_rendering", "learned_dense", "learned_spot"}
+"""Those that take whole frames, a renderer or a network's runtime."""
+
+NAMES = sorted(
+    each.name
+    for each in entry_points(group="simtest.estimators")
+    if each.dist.name == "simtest" and each.name not in ELSEWHERE
+)
+"""All others that are registered: one that is added gets these tests by its line there."""
+
 SIDE, NOISE = 161, 0.01
 CAMERAS = {
     "pinhole": Camera(SIDE, SIDE, 150.0, 150.0, SIDE / 2, SIDE / 2),
