@@ -432,8 +432,16 @@ def scene(name, step=0):
 
 
 @pytest.fixture(scope="module", params=FORMS)
-def named(request):
+def built(request):
     return request.param, Session(scene(request.param), "llvm_ad_rgb")
+
+
+@pytest.fixture
+def named(built):
+    """A form and its session, as it was built: a test before may have moved it."""
+    name, session = built
+    session.update(scene(name))
+    return name, session
 
 
 def directions(mi, count, seed):
@@ -518,7 +526,6 @@ def test_samples_have_the_density_they_claim(named):
 def test_a_sweep_builds_once_compiles_once_and_gives_what_fresh_sessions_give(named):
     """Finite, never negative, and the lobe brightest at its highlight."""
     name, session = named
-    session.update(scene(name))
     session.frame()
     import drjit as dr  # after the backend has chosen its libLLVM
 
