@@ -98,7 +98,7 @@ READERS = {
                                 {"x.toml": files.PROFILE}, damaged=0),
     "nightly accept": Reader("nightly accept --reason x --reports out", "out/nightly/quick/run.json", "{", damaged=0),
     "realism": Reader("realism x.png --against plane --out out", "x.png", PICTURE, damaged=0),
-    "fit, frames": Reader("fit x.png --recipe tiny --out o.toml", "x.png", PICTURE, damaged=0),
+    "fit, frames": Reader("fit x.png --recipe tiny --scene plane --out o.toml", "x.png", PICTURE, damaged=0),
 }  # fmt: skip
 """By the start of the cases' names."""
 
@@ -307,7 +307,7 @@ def _folders() -> Iterator[Case]:
         "no files": {"d/a.png": files.fifo, "d/b.png": files.sparse(PICTURE), "d/c.png": files.endless},
     }  # fmt: skip
     for command in ("reconstruct d --fov 60 --out out", "dataset verify d", "dataset preview d",
-                    "realism d --against plane --out out", "fit d --recipe tiny --out o.toml"):  # fmt: skip
+                    "realism d --against plane --out out", "fit d --recipe tiny --scene plane --out o.toml"):  # fmt: skip
         for what, made in folders.items():
             yield Case(f"{command.split(' --')[0]}: folder, {what}", tuple(command.split(" ")), made)
     frames = Reader("reconstruct d --fov 60 --out out", "d/a.png", PICTURE)
