@@ -11,10 +11,11 @@ import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors, exactly
 from simtest.errors import Failure, Reason
-from simtest.estimators.budget import Budget, equivalent_covariance
-from simtest.estimators.cloud_light import DiffuseLight, Shading, find_spots
+from simtest.estimators.budget import Budget, equivalent_covariance, total
+from simtest.estimators.cloud_light import DiffuseLight, find_spots
 from simtest.estimators.cloud_mixture import (
     CLUMPING,
+    LEAST_SEEN,
     Cloud,
     Mixture,
     Turns,
@@ -33,13 +34,20 @@ from simtest.runtime import chi_squared
 from simtest.runtime.fitted import fitted_number
 from simtest.runtime.statistics import CONFIDENCE
 
-ALBEDO_SLOPE, JACKKNIFE_CUBIC = fitted_number("clouds.albedo_slope"), fitted_number("clouds.jackknife_cubic")
-MOST_MISFIT = math.radians(fitted_number("clouds.most_misfit"))
-MOST_EXTENT = math.radians(fitted_number("clouds.most_extent"))
+LIGHT, JACKKNIFE = math.radians(fitted_number("clouds.light")), fitted_number("clouds.jackknife")
+OWN_SHARE = fitted_number("clouds.own_share")
+ASIDE = math.radians(fitted_number("clouds.aside"))
+DIMMER = fitted_number("clouds.dimmer")
 LEAST_GAIN = fitted_number("clouds.least_gain")
+MOST_RMS = math.radians(fitted_number("clouds.most_rms"))
+BENDS, MOST_EXTENT = fitted_number("clouds.bends"), math.radians(fitted_number("clouds.most_extent"))
 
-REFUSED, DOUBTED = 0.95, 0.68
-"""A misfit that a base with a highlight point there exceeds with less than the rest gets no answer, or a flag."""
+TYPICAL_SLOPE, SLOPES = math.radians(9.0), (math.radians(3.0), math.radians(20.0))
+"""Of a relief, where nothing tells, and what is possible. The extent of one cloud tells it to a factor of 2 only, so it
+counts for half of the logarithm."""
+
+DOUBTED = 0.95
+"""Spots and diffuse light that differ by more than this quantile lets expect are flagged."""
 
 
 @dataclass(frozen=True)
@@ -47,99 +55,45 @@ class BaseEvidence:
     """What the diffuse light says of a cloud, in ``basis_across(cloud.centre)``."""
 
     shows: bool  # whether the frame shows diffuse light: the base is tissue
-    # Chi-squared with 2 degrees of freedom where the cloud's centre is at a highlight point; 0 where nothing is told.
-    statistic: float = 0.0
-    misfit: float = 0.0  # turn of the base at the cloud's centre from where it would face the lights, rad
-    told: bool = False  # whether the misfit is known to about `MOST_MISFIT`
-    # (2, 2): inverse covariance of `shift`, rad^-2; zero where nothing is told.
-    information: Array = field(default_factory=lambda: np.zeros((2, 2)))
-    shift: Array = field(default_factory=lambda: np.zeros(2))  # (2,): from the cloud's centre to the highlight point
-
-    @property
-    def refutes(self) -> bool:
-        """Whether the base has no highlight point at the cloud's centre."""
-        return self.statistic > chi_squared.quantile(REFUSED, 2)
-
-    @property
-    def doubts(self) -> bool:
-        """Whether the base is likely not to have a highlight point there."""
-        return self.statistic > chi_squared.quantile(DOUBTED, 2)
+    told: bool = False  # whether enough is seen between the spots around this cloud
+    # (2,): turn of the base's normal at the cloud's sightline from the reversed centre, rad.
+    turn: Array = field(default_factory=lambda: np.zeros(2))
+    covariance: Array = field(default_factory=lambda: np.zeros((2, 2)))  # (2, 2): of `turn`, rad^2, by the fit
+    gains: Array = field(default_factory=lambda: np.eye(2))  # (2, 2): I + dS of the base
 
 
-def evidence_of(cloud: Cloud, light: DiffuseLight, sampling: Array, priors: Priors) -> BaseEvidence:
+def evidence_of(cloud: Cloud, light: DiffuseLight, priors: Priors) -> BaseEvidence:
     """Return what the diffuse light says of a cloud.
 
-    `cloud`: as the spots tell it; `light`: of its frame; `sampling`, (2, 2): covariance of its centre by the number of
-    its spots, in ``basis_across(cloud.centre)``, rad^2; `priors`: what is told of the lights and the falloff.
+    `cloud`: as the spots tell it; `light`: of its frame; `priors`: what is told of the lights and the falloff.
     """
-    fits = light.around(cloud.sightline, cloud.covariance) if light.shows else None
-    if fits is None:
+    fit = light.around(cloud.sightline, cloud.covariance) if light.shows else None
+    if fit is None:
         return BaseEvidence(light.shows)
-    turn = basis_across(cloud.centre) @ basis_across(cloud.sightline).T
-    quadric, cubic = (_turned(fit, turn) for fit in fits)
-    # The lights' mean turns the light by m = L / d, and the normal at the cloud by m / 2: the misfit is -m / 2.
-    expected = -cloud.turns.mean(axis=0)
-    off = quadric.gradient + quadric.steepness @ expected
-    fitted = quadric.covariance + _untold(cloud, quadric, priors)
-    centre = quadric.steepness @ quadric.gains @ sampling @ quadric.gains @ quadric.steepness
-    statistic = float(off @ np.linalg.solve(fitted + ALBEDO_SLOPE**2 * np.eye(2) + centre, off))
-    back = np.linalg.inv(quadric.steepness)
-    told = bool(np.linalg.eigvalsh(back @ fitted @ back)[-1] < MOST_MISFIT**2)
-    information, shift = np.zeros((2, 2)), np.zeros(2)
-    if priors.lights_mm:
-        information, shift = _highlight_point(cubic, expected, _untold(cloud, cubic, priors))
-    return BaseEvidence(light.shows, statistic, float(np.linalg.norm(back @ off)), told, information, shift)
-
-
-def _turned(fit: Shading, turn: Array) -> Shading:
-    """Return a fit in another basis."""
-    return Shading(turn @ fit.gradient, turn @ fit.covariance @ turn.T, turn @ fit.gains @ turn.T)
-
-
-def _untold(cloud: Cloud, fit: Shading, priors: Priors) -> Array:
-    """Return the covariance of grad ln L by a light and a falloff that nobody told, shape (2, 2), per rad^2."""
-    half, covariance = basis_across(cloud.centre), np.zeros((2, 2))
-    if not priors.lights_mm:
-        turn = fit.steepness @ half @ basis_across(-cloud.centre).T
-        covariance = turn @ light_offset_part(-cloud.centre, priors) @ turn.T
+    across = basis_across(cloud.centre) @ basis_across(cloud.sightline).T
+    gradient, gains = across @ fit.gradient, across @ fit.gains @ across.T
+    # The lights' mean turns the light by m = L / d, and the normal at the cloud by m / 2, which its centre allows for.
+    back = np.linalg.inv(2 * np.eye(2) + gains)
+    turn = cloud.turns.mean(axis=0) - back @ gradient
+    fitted = JACKKNIFE**2 * across @ fit.covariance @ across.T
     if (power := priors.falloff_power) is not None:
         # Light that falls as cos^k of the angle from the axis.
-        slope = half[:, 2] / max(float(cloud.centre[2]), 1e-3)
-        covariance = covariance + (power.mean**2 + power.sd**2) * np.outer(slope, slope)
-    return covariance
-
-
-def _highlight_point(fit: Shading, expected: Array, untold: Array) -> tuple[Array, Array]:
-    """Return the inverse covariance of where the misfit is as expected, rad^-2, and that place from the centre."""
-    gains, directions = np.linalg.eigh(fit.gains)
-    covariance = JACKKNIFE_CUBIC**2 * fit.covariance + ALBEDO_SLOPE**2 * np.eye(2) + untold
-    information, shift = np.zeros((2, 2)), np.zeros(2)
-    for gain, direction in zip(gains, directions.T, strict=True):
-        if gain < LEAST_GAIN:
-            continue
-        slope = gain * (2 + gain)
-        information += slope**2 / (direction @ covariance @ direction) * np.outer(direction, direction)
-        shift += (direction @ fit.gradient / slope + direction @ expected / gain) * direction
-    return information, shift
+        slope = basis_across(cloud.centre)[:, 2] / max(float(cloud.centre[2]), 1e-3)
+        fitted = fitted + (power.mean**2 + power.sd**2) * np.outer(slope, slope)
+    return BaseEvidence(light.shows, True, turn, LIGHT**2 * np.eye(2) + back @ fitted @ back, gains)
 
 
 LEAST_SPOTS = 6
 """A cloud of fewer spots gets no answer: a lone large highlight is a cloud of one."""
 
-LEAST_UNVERIFIED = 15
-"""Nor does a cloud of fewer spots on tissue whose diffuse light does not tell whether the base faces the light there:
-so few show no shape, and folds that come near to facing the light make such groups."""
-
-LEAST_IN_VIEW = 0.95
-"""Nor does a cloud of which less is in view, whose centre would be a guess."""
+LEAST_IN_VIEW, LEAST_VERIFIABLE = 0.95, 0.5
+"""Nor does a cloud of which less is in view, whose centre would be a guess; on tissue the diffuse light tells more."""
 
 LARGELY_SEEN = 0.98
 """A cloud of which less is in view is flagged."""
 
 UNEVEN = 0.2
 """Standard deviation of the spots that each light makes, as a share of an even part."""
-
-BENDS = fitted_number("clouds.bends")
 
 LEAST_INDEPENDENT = 2.5
 """Fewer independent spots state no extent at all."""
@@ -156,9 +110,9 @@ class CloudCentre:
     """The centre of a cloud of spots carries the base's normal, where a single highlight carries the fine one.
 
     Spots are found in the frame (`cloud_light`) and grouped into clouds (`cloud_mixture`). With the light at the camera
-    a cloud lies around the sightline at which the base faces the camera; the diffuse light says whether there is one,
-    and moves the centre to it (`evidence_of`). Lights that are told have each their part of the cloud, half their angle
-    at the surface off that sightline; lights that are not told apart are one mixture.
+    a cloud lies around the sightline at which the base faces the camera, or comes nearest to it; the diffuse light says
+    how far the base is turned there, and both are averaged (`evidence_of`). Lights that are told have each their part
+    of the cloud, half their angle at the surface off that sightline; lights that are not told apart are one mixture.
 
     Parameters
     ----------
@@ -177,7 +131,7 @@ class CloudCentre:
         likely turned from the lights at its centre; ``base_unverified`` where too little diffuse light is seen to tell;
         ``clouds_refused`` where another cloud of the frame gets no answer.
         The axis ratio, and the curvature's directions, hold for isotropic relief. Fails with ``no_estimate`` where no
-        cloud has spots enough in view, or the base has no single highlight point at any one's centre (`evidence_of`).
+        cloud has spots enough in view, or none that has tells the normal to `MOST_RMS`, beside an untold light.
         """
         spots = find_spots(frame)
         if len(spots.peaks) < self.least_spots:
@@ -185,19 +139,21 @@ class CloudCentre:
         turns, window = _turns(priors), window_of(camera, frame.seen)
         mixture = fit_mixture(camera.unproject(spots.points_px), window, turns)
         owner = np.where(mixture.belongs.sum(axis=1) > 0.5, mixture.belongs.argmax(axis=1), -1)
-        light = DiffuseLight(frame)
+        light, density = DiffuseLight(frame), max(map(density_of, mixture.clouds))
+        in_view = LEAST_VERIFIABLE if light.shows and not priors.plane else LEAST_IN_VIEW
         estimates: list[Estimate] = []
         refused: list[Failure] = []
         for i, cloud in enumerate(mixture.clouds):
             own = spots.points_px[owner == i]
-            if len(own) >= self.least_spots and cloud.seen >= LEAST_IN_VIEW and _is_in_view(cloud, camera, frame):
-                made = _estimate(cloud, own, window, camera, priors, light)
+            if len(own) >= self.least_spots and cloud.seen >= in_view and _is_in_view(cloud, camera, frame):
+                dimness = 2 * math.log(max(density / density_of(cloud), 1.0))
+                made = _estimate(cloud, own, window, camera, priors, light, dimness)
                 if isinstance(made, Failure):
                     refused.append(made)
                 else:
                     estimates.append(made)
         if not estimates:
-            return refused[0] if refused else self._none_whole(mixture, owner)
+            return refused[0] if refused else self._none_whole(mixture, owner, in_view)
         if refused:
             estimates = [replace(each, flags=(*each.flags, "clouds_refused")) for each in estimates]
         return sorted(estimates, key=lambda estimate: -len(_shape(estimate).points_px))
@@ -206,14 +162,14 @@ class CloudCentre:
         what = "1 bright spot" if count == 1 else f"{count} bright spots"
         return Failure(Reason.NO_ESTIMATE, f"{what}: a cloud takes {self.least_spots}; a lone highlight is none")
 
-    def _none_whole(self, mixture: Mixture, owner: Array) -> Failure:
+    def _none_whole(self, mixture: Mixture, owner: Array, in_view: float) -> Failure:
         counts = [int(np.count_nonzero(owner == i)) for i in range(len(mixture.clouds))]
         largest = int(np.argmax(counts))
         seen = 100 * mixture.clouds[largest].seen
         return Failure(
             Reason.NO_ESTIMATE,
             f"the largest cloud has {counts[largest]} spots and {seen:.0f} % of it in view: it takes "
-            f"{self.least_spots}, {100 * LEAST_IN_VIEW:.0f} %, and its centre in view",
+            f"{self.least_spots}, {100 * in_view:.0f} %, and its centre in view",
         )
 
 
@@ -223,6 +179,11 @@ cloud = CloudCentre()
 def _shape(estimate: Estimate) -> CloudShape:
     assert estimate.cloud is not None
     return estimate.cloud
+
+
+def density_of(cloud: Cloud) -> float:
+    """Return the density of a cloud's spots at its centre, up to a factor that all clouds of a frame share."""
+    return cloud.share / max(cloud.seen, LEAST_SEEN) / math.sqrt(float(np.linalg.det(cloud.covariance)))
 
 
 def _turns(priors: Priors) -> Turns:
@@ -248,19 +209,26 @@ def _is_in_view(cloud: Cloud, camera: Camera, frame: Frame) -> bool:
 
 
 def _estimate(
-    cloud: Cloud, points_px: Array, window: Window, camera: Camera, priors: Priors, light: DiffuseLight
+    cloud: Cloud, points_px: Array, window: Window, camera: Camera, priors: Priors, light: DiffuseLight, dimness: float
 ) -> Estimate | Failure:
-    """Return the estimate of one cloud, or why its centre says nothing of the base's normal."""
+    """Return the estimate of one cloud, or why it says nothing of the base's normal.
+
+    `dimness`: log of the frame's densest cloud's density of spots over that of this one.
+    """
     independent = max(len(points_px) / CLUMPING, LEAST_INDEPENDENT)
-    sampling = sampling_covariance(cloud, window, independent)
-    evidence = BaseEvidence(False) if priors.plane else evidence_of(cloud, light, sampling, priors)
-    if (doubt := _refusal(cloud, evidence, len(points_px))) is not None:
-        return doubt
-    bends = np.zeros((2, 2)) if priors.plane else _bends(cloud, camera.unproject(points_px), evidence)
-    cloud, parts = _with_light(cloud, sampling * small_sample(independent), bends, evidence, _turns(priors))
-    if not _is_in_view(cloud, camera, light.frame):
-        return _unstated(len(points_px), "the diffuse light says that its centre lies out of view")
-    normal = -cloud.centre
+    sampling = sampling_covariance(cloud, window, independent) * small_sample(independent)
+    evidence = BaseEvidence(False) if priors.plane else evidence_of(cloud, light, priors)
+    if evidence.shows:
+        made = _on_tissue(cloud, sampling, evidence, dimness, len(points_px), priors)
+        if isinstance(made, Failure):
+            return made
+        cloud, normal, budget, doubted = made
+        if not _is_in_view(cloud, camera, light.frame):
+            return _unstated(len(points_px), "the diffuse light says that its centre lies out of view")
+    else:
+        normal, doubted = -cloud.centre, False
+        bends = np.zeros((2, 2)) if priors.plane else _bends(cloud, camera.unproject(points_px))
+        budget = _budget(cloud, {"relief": sampling, "shape": bends}, priors)
     lobe = LOBE_RAD2 if priors.lobe_curvature is None else exactly(1 / priors.lobe_curvature.mean)
     slope = slope_of(cloud.covariance, independent, lobe)
     shape = CloudShape(points_px, cloud.covariance, independent, cloud.seen, lobe, slope)
@@ -271,8 +239,8 @@ def _estimate(
         candidates=normal[None],
         look_px=camera.project(cloud.sightline),
         axis_ratio=shape.axis_ratio,
-        budget=_budget(cloud, parts, priors),
-        flags=_flags(cloud, shape, evidence, priors),
+        budget=budget,
+        flags=_flags(cloud, shape, evidence, doubted, priors),
         curvature=EstimatedCurvature(vectors, shape.axis_ratio),
         target="base",
         cloud=shape,
@@ -280,19 +248,82 @@ def _estimate(
     return add_common_parts(estimate, camera, priors)
 
 
-def _refusal(cloud: Cloud, evidence: BaseEvidence, spots: int) -> Failure | None:
-    """Return why a cloud gets no answer: the base has no highlight point there, several, or nothing shows one."""
-    if evidence.refutes:
-        off = math.degrees(evidence.misfit)
-        why = f"the diffuse light says that the base is turned by {off:.0f} deg from facing the light at its centre"
-    elif evidence.shows and _extent(cloud) > MOST_EXTENT:
-        most, extent = (math.degrees(value) for value in (MOST_EXTENT, _extent(cloud)))
-        why = f"its extent is {extent:.0f} deg, over {most:.0f}: the base has several highlight points there or none"
-    elif evidence.shows and not evidence.told and spots < LEAST_UNVERIFIED:
-        why = f"the diffuse light does not tell whether the base faces the light there: it takes {LEAST_UNVERIFIED}"
-    else:
-        return None
-    return _unstated(spots, why)
+def _on_tissue(
+    cloud: Cloud, sampling: Array, evidence: BaseEvidence, dimness: float, spots: int, priors: Priors
+) -> tuple[Cloud, Array, Budget, bool] | Failure:
+    """Return a cloud on tissue moved to the base's highlight point, its normal, its budget, and whether it is doubted.
+
+    The spots say that the base faces the lights at the centre, the diffuse light how far it is turned there: both are
+    averaged, weighted by their covariances. Where the gain allows it the centre moves to where the base faces the
+    lights; along directions of a smaller gain the normal turns in its place.
+    """
+    if not evidence.told:
+        return _unstated(spots, "too little diffuse light is seen there to tell whether the base faces the light")
+    half, turn = basis_across(cloud.centre), evidence.turn
+    own, untold = spots_covariance(cloud, sampling, evidence, dimness), np.zeros((2, 2))
+    if not priors.lights_mm:
+        across = half @ basis_across(-cloud.centre).T
+        untold = across @ light_offset_part(-cloud.centre, priors) @ across.T
+    # A light beside the camera turns the normal at the spots by half of its angle, and the light by all of it.
+    gap = own + evidence.covariance + untold
+    doubted = float(turn @ np.linalg.solve(gap, turn)) > chi_squared.quantile(DOUBTED, 2)
+    # Far from facing the light its logarithm is no quadric.
+    of_light = evidence.covariance + OWN_SHARE**2 * float(turn @ turn) * np.eye(2)
+    weight = _positive(own - untold) @ np.linalg.inv(own + of_light + untold)
+    rest, common = np.eye(2) - weight, np.eye(2) + weight
+    parts = {"relief": rest @ own @ rest.T, "shape": weight @ of_light @ weight.T}
+    if untold.any():
+        parts["light_offset"] = common @ untold @ common.T
+    moved, normal = _turned(cloud, weight @ turn, evidence.gains, _turns(priors))
+    budget = _budget(moved, parts, priors)
+    rms = math.sqrt(float(np.trace(total(budget))))
+    if rms > MOST_RMS + math.sqrt(float(np.trace(untold))):
+        off, known = (
+            math.degrees(float(np.linalg.norm(turn))),
+            f"its normal would be known to {math.degrees(rms):.1f} deg",
+        )
+        if doubted:
+            known += f"; the diffuse light says that the base is turned by {off:.0f} deg from facing the light there"
+        return _unstated(spots, known)
+    return moved, normal, budget, doubted
+
+
+def spots_covariance(cloud: Cloud, sampling: Array, evidence: BaseEvidence, dimness: float) -> Array:
+    """Return the covariance of the base's turn at a cloud's centre as the spots tell it, shape (2, 2), rad^2.
+
+    By the number of spots; by changes of curvature and folds; and since a base that nowhere faces the lights still
+    glitters most where it comes nearest: by sqrt(2 ln(A_max / A)) of the relief's slope, A the density of spots.
+    """
+    spread = evidence.gains @ cloud.covariance @ evidence.gains.T
+    slope = math.sqrt(TYPICAL_SLOPE * min(max(math.sqrt(float(np.trace(spread)) / 2), SLOPES[0]), SLOPES[1]))
+    relative = np.linalg.solve(cloud.covariance, sampling)
+    share = float(np.trace(relative)) / 2 + DIMMER**2 * dimness
+    return (ASIDE**2 + slope**2 * share) * np.eye(2)
+
+
+def _positive(matrix: Array) -> Array:
+    """Return the nearest symmetric matrix without negative eigenvalues."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return np.asarray(vectors @ np.diag(np.maximum(values, 0.0)) @ vectors.T)
+
+
+def _turned(cloud: Cloud, turn: Array, gains: Array, turns: Turns) -> tuple[Cloud, Array]:
+    """Return a cloud moved to where the base faces the lights, and the base's normal at its new sightline.
+
+    `turn`, (2,): of the base's normal at the cloud from the reversed centre, rad.
+    """
+    half = basis_across(cloud.centre)
+    values, vectors = np.linalg.eigh(gains)
+    parts = vectors.T @ turn
+    moves = values >= LEAST_GAIN
+    way = vectors[:, moves] @ (parts[moves] / values[moves])
+    left = vectors[:, ~moves] @ parts[~moves]
+    centre = cloud.centre - way @ half
+    centre /= np.linalg.norm(centre)
+    across = basis_across(centre) @ half.T
+    normal = left @ half - centre
+    moved = replace(cloud, centre=centre, covariance=across @ cloud.covariance @ across.T, turns=turns(centre))
+    return moved, np.asarray(normal / np.linalg.norm(normal))
 
 
 def _unstated(spots: int, why: str) -> Failure:
@@ -304,7 +335,7 @@ def _extent(cloud: Cloud) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(cloud.covariance)[-1]))
 
 
-def _bends(cloud: Cloud, sightlines: Array, evidence: BaseEvidence) -> Array:
+def _bends(cloud: Cloud, sightlines: Array) -> Array:
     """Return the covariance of a cloud's centre by changes of the base's gains inside it, shape (2, 2), rad^2.
 
     Where the density of spots is p(w), w the base's misfit and quadratic in x, the centroid is off by half of
@@ -319,31 +350,7 @@ def _bends(cloud: Cloud, sightlines: Array, evidence: BaseEvidence) -> Array:
     x = np.linalg.solve(np.linalg.cholesky(gap.T @ gap / len(gap)), gap.T)
     off = (x * (x**2).sum(axis=0)).mean(axis=1) / 2
     excess = float(off @ off) / 2 - 2 * CLUMPING / len(points)
-    return np.asarray(max(excess, BENDS**2 if evidence.shows else 0.0) * cloud.covariance)
-
-
-def _with_light(
-    cloud: Cloud, sampling: Array, bends: Array, evidence: BaseEvidence, turns: Turns
-) -> tuple[Cloud, dict[str, Array]]:
-    """Return a cloud whose centre the diffuse light has moved, weighted by both covariances, and the parts of its own.
-
-    The parts ``relief`` and ``shape`` are in the basis across the cloud's new centre.
-    """
-    parts = {"relief": sampling, "shape": bends}
-    if not evidence.information.any():
-        return cloud, parts
-    alone = np.linalg.inv(sampling + bends)
-    together = np.linalg.inv(alone + evidence.information)
-    rest, basis = together @ alone, basis_across(cloud.centre)
-    centre = cloud.centre + together @ evidence.information @ evidence.shift @ basis
-    centre /= np.linalg.norm(centre)
-    turn = basis_across(centre) @ basis.T
-    parts = {
-        "relief": rest @ sampling @ rest.T,
-        "shape": rest @ bends @ rest.T + together @ evidence.information @ together,
-    }
-    moved = replace(cloud, centre=centre, covariance=turn @ cloud.covariance @ turn.T, turns=turns(centre))
-    return moved, {name: turn @ part @ turn.T for name, part in parts.items()}
+    return np.asarray(max(excess, 0.0) * cloud.covariance)
 
 
 def _budget(cloud: Cloud, parts: dict[str, Array], priors: Priors) -> Budget:
@@ -353,7 +360,7 @@ def _budget(cloud: Cloud, parts: dict[str, Array], priors: Priors) -> Budget:
     turn = basis_across(normal) @ half.T
     budget = {name: turn @ part @ turn.T for name, part in parts.items()}
     if not priors.lights_mm:
-        budget["light_offset"] = light_offset_part(normal, priors)
+        budget.setdefault("light_offset", light_offset_part(normal, priors))
     elif not _is_at_camera(priors):
         # Lights may make different numbers of spots; the mean of all moves with the distance.
         spread = cloud.spread * UNEVEN**2 / len(cloud.turns)
@@ -383,7 +390,7 @@ def small_sample(independent: float) -> float:
     return 2 * (independent - 1) / rest * F / chi_squared.quantile(CONFIDENCE, 2)
 
 
-def _flags(cloud: Cloud, shape: CloudShape, evidence: BaseEvidence, priors: Priors) -> tuple[str, ...]:
+def _flags(cloud: Cloud, shape: CloudShape, evidence: BaseEvidence, doubted: bool, priors: Priors) -> tuple[str, ...]:
     flags = []
     if _is_long(cloud.covariance, shape.independent):
         flags.append("anisotropic_or_curved")
@@ -392,7 +399,7 @@ def _flags(cloud: Cloud, shape: CloudShape, evidence: BaseEvidence, priors: Prio
     if not priors.plane:
         if _extent(cloud) > MOST_EXTENT:
             flags.append("wide")
-        if evidence.doubts:
+        if doubted:
             flags.append("base_doubted")
         elif not evidence.told:
             flags.append("base_unverified")

@@ -5,7 +5,7 @@ is the turn of its normal from the reversed sightline. Across a sightline w = gr
 
     grad ln L = -(2 + J) w,    J = grad w = I + dS,    Hessian of ln L = -(2 J + J^2) where w = 0.
 
-A polynomial of ln L around a cloud gives J, and w at its centre. At a highlight point of the base w = 0. Folds that
+A quadric of ln L around a cloud gives J, and w at its centre. At a highlight point of the base w = 0. Folds that
 come near to facing the camera make clouds too; there w is not 0. To first order a light beside the camera, at L across
 the sightline, turns all by L / d: w - L / d takes the place of w.
 
@@ -227,8 +227,9 @@ MOST_MISSING = 0.05
 LEAST_LIGHT = 5.0
 """Light below so many standard deviations of the noise is dark."""
 
-LEAST_LIT = 0.1
-"""A frame shows diffuse light where this share of its pixels is lit between the spots."""
+LEAST_LIT, GLITTERING = 0.1, 0.2
+"""A frame shows diffuse light where this share of its pixels is lit between the spots, or the second anywhere: steep
+relief strews its spots so densely that nothing is left between them."""
 
 STEPS, OUTLYING = 6, 2.0
 """Steps of the robust fit; residuals of more standard deviations count less."""
@@ -252,11 +253,6 @@ class Shading:
     covariance: Array  # (2, 2): of `gradient`, by the jackknife over sectors
     gains: Array  # (2, 2): I + dS of the base. A gain g below -1 makes the same light as -2 - g, which is given for it.
 
-    @property
-    def steepness(self) -> Array:
-        """2 + J, shape (2, 2)."""
-        return np.asarray(2 * np.eye(2) + self.gains)
-
 
 @dataclass(frozen=True)
 class DiffuseLight:
@@ -265,8 +261,11 @@ class DiffuseLight:
     frame: Frame  # falloffs that its calibration knows are undone
 
     @cached_property
-    def _logs(self) -> tuple[Array, Mask, Mask]:
-        """Return logs of the channels, shape (h, w, C), where they are lit between the spots, and not clipped there."""
+    def _logs(self) -> tuple[Array, Mask, Mask, float]:
+        """Return logs of the channels, (h, w, C), where they are lit between the spots, and not clipped there.
+
+        The last is the share of pixels that are lit anywhere.
+        """
         frame, cut = self.frame, (slice(None, None, STRIDE), slice(None, None, STRIDE))
         encoded = frame.encoded if frame.encoded.ndim == 3 else frame.encoded[..., None]
         light = frame.channels if frame.encoded.ndim == 3 else frame.channels[..., None]
@@ -274,13 +273,14 @@ class DiffuseLight:
         values = light[cut] if gain is None else light[cut] * gain[cut][..., None]
         # The noise is that of the channels' mean.
         lit = values > LEAST_LIGHT * float(np.median(frame.noise)) * np.sqrt(light.shape[2])
+        anywhere = float(lit.any(axis=2).mean())
         margin = np.ones((2 * SPOT_MARGIN_PX + 1, 2 * SPOT_MARGIN_PX + 1), np.uint8)
         lit &= ~(cv2.dilate(bright_parts(frame).astype(np.uint8), margin)[cut] > 0)[..., None]
         if frame.seen is not None:
             lit &= frame.seen[cut][..., None]
         level = frame.calibration.saturation_level
         unclipped = lit if level is None else lit & (encoded[cut] < level)
-        return np.log(np.maximum(values, 1e-9), dtype=np.float64), lit, unclipped
+        return np.log(np.maximum(values, 1e-9), dtype=np.float64), lit, unclipped, anywhere
 
     @cached_property
     def _sightlines(self) -> Array:
@@ -291,13 +291,12 @@ class DiffuseLight:
 
     @cached_property
     def shows(self) -> bool:
-        """Whether the frame shows diffuse light between its spots."""
-        return bool(self._logs[1].any(axis=2).mean() > LEAST_LIT)
+        """Whether the frame shows diffuse light: its base is tissue, not dark."""
+        _, lit, _, anywhere = self._logs
+        return bool(lit.any(axis=2).mean() > LEAST_LIT or anywhere > GLITTERING)
 
-    def around(self, sightline: Array, covariance: Array) -> tuple[Shading, Shading] | None:
-        """Fit polynomials of second and third degree to the light around a sightline.
-
-        The first is steadier; the second knows that the gains change.
+    def around(self, sightline: Array, covariance: Array) -> Shading | None:
+        """Fit a quadric to the logarithm of the light around a sightline.
 
         `sightline`, (3,): unit; `covariance`, (2, 2): of the cloud in the plane across the sightline at unit distance,
         in its basis, rad^2. Returns none where too little is seen between the spots.
@@ -307,7 +306,7 @@ class DiffuseLight:
         reach = covariance + LEAST_EXTENT**2 * np.eye(2)
         radius2 = np.nan_to_num(np.einsum("ni,ij,nj->n", points, np.linalg.inv(reach), points), nan=np.inf)
         inside = np.flatnonzero(radius2 < REACH**2)
-        logs, _, sound = self._logs
+        logs, _, sound, _ = self._logs
         logs, sound = logs.reshape(-1, logs.shape[2])[inside], sound.reshape(-1, sound.shape[2])[inside]
         enough = np.flatnonzero(sound.sum(axis=0) >= max(LEAST_PIXELS, LEAST_SHARE * len(inside)))
         if not len(enough):
@@ -319,16 +318,14 @@ class DiffuseLight:
         # Albedo changes the ratios of the channels, shading does not.
         hues = logs[kept][:, others] - logs[kept, main][:, None]
         points, radius2 = points[inside][kept], radius2[inside][kept]
-        second, third = (_fitted(points, radius2, logs[kept, main], hues, cubic) for cubic in (False, True))
-        return second, third
+        return _fitted(points, radius2, logs[kept, main], hues)
 
 
-def _fitted(points: Array, radius2: Array, values: Array, hues: Array, cubic: bool) -> Shading:
-    """Fit a polynomial and the hues' share to logs of light, shape (N,), at points, shape (N, 2)."""
+def _fitted(points: Array, radius2: Array, values: Array, hues: Array) -> Shading:
+    """Fit a quadric and the hues' share to logs of light, shape (N,), at points, shape (N, 2)."""
     scale = float(np.sqrt((points**2).mean()))
     x, y = points.T / scale
     terms = [np.ones_like(x), x, y, x**2 / 2, x * y, y**2 / 2]
-    terms += [x**3, x**2 * y, x * y**2, y**3] if cubic else []
     A = np.column_stack([*terms, hues - hues.mean(axis=0)])
     near = np.exp(-radius2 / 4)
     weights = near

@@ -307,7 +307,8 @@ def _folders() -> Iterator[Case]:
         "no files": {"d/a.png": files.fifo, "d/b.png": files.sparse(PICTURE), "d/c.png": files.endless},
     }  # fmt: skip
     for command in ("reconstruct d --fov 60 --out out", "dataset verify d", "dataset preview d",
-                    "realism d --against plane --out out", "fit d --recipe tiny --scene plane --out o.toml"):  # fmt: skip
+                    "realism d --against plane --out out", "fit d --recipe tiny --scene plane --out o.toml",
+                    ):  # fmt: skip
         for what, made in folders.items():
             yield Case(f"{command.split(' --')[0]}: folder, {what}", tuple(command.split(" ")), made)
     frames = Reader("reconstruct d --fov 60 --out out", "d/a.png", PICTURE)

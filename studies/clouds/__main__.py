@@ -25,7 +25,7 @@ SLOPES, WAVES = (4.0, 5.0, 3.0, 6.0), (1.5, 2.0)
 
 
 def tuned_tissue() -> dict[str, list[Case]]:
-    """Return the tissue that the constants were fitted to, by organ."""
+    """Return the tissue that earlier versions were set on, by organ."""
     return {
         "colon": [tissue("colon", TUNED_TISSUE + i) for i in range(70)],
         "liver": [tissue("liver", TUNED_TISSUE + i) for i in range(32)],

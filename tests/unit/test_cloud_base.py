@@ -8,8 +8,10 @@ import pytest
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Frame, Priors, Response, exactly
 from simtest.errors import Failure
 from simtest.estimators import cloud as cloud_module
-from simtest.estimators.cloud import BaseEvidence, cloud
+from simtest.estimators import cloud_light
+from simtest.estimators.cloud import DIMMER, BaseEvidence, cloud, spots_covariance
 from simtest.estimators.cloud_light import DiffuseLight
+from simtest.estimators.cloud_mixture import Cloud
 from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg, basis_across
 
@@ -67,19 +69,22 @@ def estimates(frame, priors=LIGHT_AT_CAMERA):
     return cloud.estimate_frame(frame, CAMERA, priors)
 
 
+def misfit_of(shading):
+    """The base's turn from facing the light, by grad ln L = -(2 + J) w."""
+    return -np.linalg.solve(2 * np.eye(2) + shading.gains, shading.gradient)
+
+
 @pytest.mark.parametrize("radius", [10.0, 20.0, 60.0])
 def test_light_of_a_sphere_tells_its_gains_and_where_it_faces_the_camera(radius):
     """1 + d k is 1 + d / R in all directions; two degrees beside the highlight point the misfit is so much."""
     gain = 1 + 20.0 / radius
     facing, beside = direction(5.0, 3.0), direction(7.0, 3.0)
     light = DiffuseLight(frame_of(light_of_sphere(facing, radius=radius), noise=0.0005))
-    quadric, cubic = light.around(facing, COVARIANCE)
-    assert np.linalg.eigvalsh(cubic.gains) == pytest.approx([gain, gain], rel=0.15)
-    for fit in light.around(beside, COVARIANCE):
-        misfit = -np.linalg.solve(fit.steepness, fit.gradient)
-        expected = gain * basis_across(beside) @ (beside - facing)
-        assert misfit == pytest.approx(expected, abs=0.25 * np.linalg.norm(expected))
-    assert np.linalg.norm(np.linalg.solve(quadric.steepness, quadric.gradient)) < math.radians(0.3)
+    at_point, aside = (light.around(sightline, COVARIANCE) for sightline in (facing, beside))
+    assert np.linalg.eigvalsh(at_point.gains) == pytest.approx([gain, gain], rel=0.15)
+    expected = gain * basis_across(beside) @ (beside - facing)
+    assert misfit_of(aside) == pytest.approx(expected, abs=0.25 * np.linalg.norm(expected))
+    assert np.linalg.norm(misfit_of(at_point)) < math.radians(0.3)
 
 
 def test_vessels_do_not_turn_the_base():
@@ -93,7 +98,7 @@ def test_vessels_do_not_turn_the_base():
     coloured = Frame(picture.astype(np.float32), calibration, 1.0)
     grey = Frame(picture[..., 0].astype(np.float32), calibration, 1.0)
     with_hue, without = (
-        np.linalg.norm(DiffuseLight(frame).around(facing, COVARIANCE)[0].gradient) for frame in (coloured, grey)
+        np.linalg.norm(DiffuseLight(frame).around(facing, COVARIANCE).gradient) for frame in (coloured, grey)
     )
     assert without > 0.2
     assert with_hue < 0.1 * without
@@ -110,6 +115,16 @@ def test_a_dark_frame_verifies_nothing():
     assert not {"base_unverified", "base_doubted"} & set(verified.flags)
 
 
+def test_tissue_full_of_glitter_is_not_dark(monkeypatch):
+    """Nothing is left between its spots: a dark base has no light there either, and little elsewhere."""
+    monkeypatch.setattr(cloud_light, "bright_parts", lambda frame: np.ones(Y.shape, dtype=bool))
+    tissue, dark = (np.where(share * CAMERA.width > X, 0.4, 0.0) for share in (0.4, 0.1))
+    shown = [
+        DiffuseLight(Frame(picture.astype(np.float32), Calibration(CAMERA), 1.0)).shows for picture in (tissue, dark)
+    ]
+    assert shown == [True, False]
+
+
 def test_a_cloud_where_the_base_is_turned_away_gets_no_answer():
     """Spots about a direction 9 deg off the one at which the base faces the camera: 18 deg of misfit."""
     points = points_around(direction(9.0))
@@ -118,17 +133,14 @@ def test_a_cloud_where_the_base_is_turned_away_gets_no_answer():
     assert "diffuse light says that the base is turned by" in made.detail
 
 
-def test_few_spots_whose_base_nothing_verifies_get_no_answer(monkeypatch):
-    """Where the light verifies the base so few are answered, and more are answered with a flag where it does not."""
-    few, many = (frame_of(light_of_sphere(direction(0.0)), points_around(direction(0.0), count=n)) for n in (12, 20))
-    (verified,) = estimates(few)
+def test_a_cloud_on_tissue_whose_light_tells_nothing_gets_no_answer(monkeypatch):
+    frame = frame_of(light_of_sphere(direction(0.0)), points_around(direction(0.0), count=20))
+    (verified,) = estimates(frame)
     assert "base_unverified" not in verified.flags
     monkeypatch.setattr(cloud_module, "evidence_of", lambda *_: BaseEvidence(True))
-    refused = estimates(few)
+    refused = estimates(frame)
     assert isinstance(refused, Failure)
-    assert "12 spots states no normal: the diffuse light does not tell" in refused.detail
-    (flagged,) = estimates(many)
-    assert "base_unverified" in flagged.flags
+    assert "20 spots states no normal: too little diffuse light" in refused.detail
 
 
 def test_a_refused_cloud_leaves_a_flag_on_the_others():
@@ -171,22 +183,53 @@ def test_a_light_beside_the_camera_is_taken_into_account():
     assert "base_doubted" not in found.flags
 
 
-def test_where_the_light_is_untold_it_refutes_nothing():
-    points = points_around(direction(5.0))
-    light = light_of_sphere(direction(0.0))
-    assert isinstance(estimates(frame_of(light, points)), Failure)
-    (found,) = estimates(frame_of(light, points, Priors()), Priors())
-    assert angle_deg(found.normal, -direction(5.0)) < 1.5
+def test_regions_hold_the_normal_where_an_estimate_looks_with_the_light_told_and_untold():
+    """Spots about a direction 5 deg off the highlight point, where the base is turned by 10 deg from the camera."""
+    points, radius, distance = points_around(direction(5.0)), 20.0, 20.0
+    light = light_of_sphere(direction(0.0), distance, radius)
+    for priors in (LIGHT_AT_CAMERA, Priors()):
+        (found,) = estimates(frame_of(light, points, priors), priors)
+        look = CAMERA.unproject(found.look_px)
+        along = look[2] * (distance + radius)
+        root = math.sqrt(along**2 - (distance + radius) ** 2 + radius**2)
+        normal = ((along - root) * look - np.array([0.0, 0.0, distance + radius])) / radius
+        error = math.radians(float(angle_deg(found.normal, normal)))
+        assert error**2 < 3 * np.trace(found.covariance)
+        # Spots alone say -direction(5), off by 10 deg, with a region of their own of 1.5 deg.
+        assert error < math.radians(8.0)
+    assert math.degrees(math.sqrt(np.trace(found.covariance))) > 6.0
 
 
-def test_a_wide_cloud_on_tissue_gets_no_answer_and_on_a_dark_base_a_flag():
+def test_a_normal_that_is_told_too_poorly_is_none(monkeypatch):
+    """The light decides what a cloud's centre, with its folds, does not tell."""
+    frame = frame_of(light_of_sphere(direction(0.0)), points_around(direction(0.0)))
+    (found,) = estimates(frame)
+    rms = math.sqrt(np.trace(found.covariance))
+    monkeypatch.setattr(cloud_module, "MOST_RMS", 0.9 * rms)
+    refused = estimates(frame)
+    assert isinstance(refused, Failure)
+    assert f"its normal would be known to {math.degrees(rms):.1f} deg" in refused.detail
+
+
+def test_a_cloud_of_fewer_spots_than_the_densest_is_known_less_well():
+    """A base that nowhere faces the lights glitters most where it comes nearest, but less than one that does."""
+    extent, gain = math.radians(4.0), 2.0
+    found = Cloud(direction(0.0), extent**2 * np.eye(2), np.zeros((1, 2)), 1.0)
+    evidence, none = BaseEvidence(True, told=True, gains=gain * np.eye(2)), np.zeros((2, 2))
+    ratio = 4.0
+    dense, faint = (spots_covariance(found, none, evidence, 2 * math.log(each)) for each in (1.0, ratio))
+    # The relief's slope is that of the cloud's extent, gain * extent, halfway to a typical one of 9 deg.
+    added = DIMMER**2 * 2 * math.log(ratio) * math.radians(9.0) * gain * extent
+    assert faint - dense == pytest.approx(added * np.eye(2), rel=1e-9)
+
+
+def test_a_wide_cloud_has_a_flag_with_or_without_tissue_below():
     points = points_around(direction(0.0), count=60, extent_px=35.0)
-    made = estimates(frame_of(light_of_sphere(direction(0.0), radius=200.0), points))
-    assert isinstance(made, Failure)
-    assert "its extent is" in made.detail
+    (lit,) = estimates(frame_of(light_of_sphere(direction(0.0), radius=200.0), points))
     dark = Frame((frame_of(np.ones(Y.shape), points).encoded - 0.4).astype(np.float32),
                  Calibration(CAMERA, priors=LIGHT_AT_CAMERA), 1.0)  # fmt: skip
     (found, *_) = estimates(dark)
+    assert "wide" in lit.flags
     assert "wide" in found.flags
 
 
@@ -206,7 +249,8 @@ def test_bends_are_what_the_spots_show_beyond_chance():
 
 
 def test_a_centre_that_the_light_moves_out_of_view_is_no_answer(monkeypatch):
-    far = BaseEvidence(True, told=True, information=1e9 * np.eye(2), shift=np.array([1.2, 0.0]))
+    far = BaseEvidence(True, told=True, turn=np.array([1.2, 0.0]), covariance=1e-9 * np.eye(2))
+    monkeypatch.setattr(cloud_module, "OWN_SHARE", 0.0)
     monkeypatch.setattr(cloud_module, "evidence_of", lambda *_: far)
     made = estimates(frame_of(light_of_sphere(direction(0.0)), points_around(direction(0.0))))
     assert isinstance(made, Failure)

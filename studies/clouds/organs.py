@@ -1,0 +1,176 @@
+"""Clouds on rendered organs, whose base is known: python -m studies.clouds.organs [FIRST_SEED] [FRAMES] [--fit].
+
+FRAMES of each organ and slope, rendered once into the folder; each is read with the lights told and without, and the
+error is that against the base's normal where an answer looks. With `--fit` the constants of `cloud` are fitted to the
+clouds of these frames, before any is refused.
+"""
+
+import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import minimize
+
+from simtest.calibration import Frame
+from simtest.errors import Failure
+from simtest.estimators.budget import total
+from simtest.estimators.cloud import SLOPES, TYPICAL_SLOPE, cloud, density_of
+from simtest.estimators.cloud_light import DiffuseLight, find_spots
+from simtest.estimators.cloud_mixture import CLUMPING, fit_mixture, sampling_covariance, window_of
+from simtest.geometry.vectors import basis_across
+from simtest.runtime.arrays import Array
+from studies.clouds.organ_frames import ORGANS, SLOPES_DEG, BaseFrame, frames
+from studies.kept import of_this_code
+
+SMOOTHING_PX = 1.0
+REGION = 3.0
+"""Squared radius of the 95 % region over the mean square of the error."""
+
+SURE, SURE_DEG = 3.0, 5.0
+"""Wrong and sure: so many times the stated error, and by so much."""
+
+LEAST_SPOTS = 3
+"""Clouds of fewer are not fitted to."""
+
+
+@dataclass(frozen=True)
+class Read:
+    """A frame that was read: whether the lights were told, and of each answer its error and its radius, deg."""
+
+    organ: str
+    slope_deg: float
+    told: bool
+    answers: Sequence[tuple[float, float]]
+
+
+def read(frame: BaseFrame, told: bool) -> list[tuple[float, float]]:
+    """Return the error against the base's normal where an answer looks, and its 95 % radius, deg, of each answer."""
+    calibration = frame.calibration
+    priors = calibration.priors if told else replace(calibration.priors, lights_mm=())
+    given = Frame(frame.picture, calibration, SMOOTHING_PX)
+    made = cloud.estimate_frame(given, given.camera, priors)
+    answers = []
+    for each in [] if isinstance(made, Failure) else made:
+        if (truth := frame.normal_at(each.look_px)) is not None:
+            error = float(np.arccos(np.clip(each.normal @ truth, -1.0, 1.0)))
+            answers.append((math.degrees(error), math.degrees(math.sqrt(REGION * np.trace(total(each.budget))))))
+    return answers
+
+
+def line(name: str, held: Sequence[Read]) -> str:
+    """Return a row of the table."""
+    answered = sum(bool(each.answers) for each in held)
+    start = f"| {name} | {len(held)} | {answered} |"
+    if not answered:
+        return f"{start} 0 | | | | | |"
+    error, radius = np.array([answer for each in held for answer in each.answers]).T
+    sure = np.count_nonzero((error > SURE * radius / math.sqrt(REGION)) & (error > SURE_DEG))
+    return (
+        f"{start} {len(error)} | {np.median(error):.1f} | {np.quantile(error, 0.95):.1f} | {np.mean(radius):.1f} | "
+        f"{100 * np.mean(error <= radius):.0f} % | {sure} |"
+    )
+
+
+@dataclass(frozen=True)
+class Found:
+    """A cloud before it is judged, of a frame whose lights are told; angles in rad.
+
+    `truth`, `light`, (2,): turn of the base from the reversed centre, and what the diffuse light says of it;
+    `jackknife`, (2, 2): its covariance by the jackknife; `chance`, `dimness`: variances of the turn by the number of
+    spots and by a density below the frame's densest, each for constants of 1.
+    """
+
+    truth: Array
+    light: Array
+    jackknife: Array
+    chance: float
+    dimness: float
+
+
+def found_in(frame: BaseFrame) -> list[Found]:
+    """Return the clouds of a frame around which enough diffuse light is seen."""
+    calibration = frame.calibration
+    given, camera = Frame(frame.picture, calibration, SMOOTHING_PX), calibration.camera
+    spots, light, rows = find_spots(given), DiffuseLight(given), []
+    if len(spots.peaks) < LEAST_SPOTS or not light.shows:
+        return []
+    lights, twice = calibration.priors.lights, 2 * calibration.priors.distance.mean
+    window = window_of(camera, given.seen)
+    mixture = fit_mixture(
+        camera.unproject(spots.points_px), window, lambda centre: lights @ basis_across(centre).T / twice
+    )
+    owner, densest = mixture.belongs.argmax(axis=1), max(map(density_of, mixture.clouds))
+    for i, each in enumerate(mixture.clouds):
+        count, truth = int(np.count_nonzero(owner == i)), frame.normal_at(camera.project(each.sightline))
+        shading = light.around(each.sightline, each.covariance)
+        if count < LEAST_SPOTS or truth is None or shading is None:
+            continue
+        half = basis_across(each.centre)
+        across = half @ basis_across(each.sightline).T
+        gains = across @ shading.gains @ across.T
+        back = np.linalg.inv(2 * np.eye(2) + gains) @ across
+        slope = math.sqrt(float(np.trace(gains @ each.covariance @ gains.T)) / 2)
+        square = TYPICAL_SLOPE * float(np.clip(slope, *SLOPES))
+        sampling = sampling_covariance(each, window, max(count / CLUMPING, 2.5))
+        rows.append(
+            Found(
+                half @ (truth + each.centre),
+                each.turns.mean(axis=0) - back @ shading.gradient,
+                back @ shading.covariance @ back.T,
+                square * float(np.trace(np.linalg.solve(each.covariance, sampling))) / 2,
+                square * 2 * math.log(max(densest / density_of(each), 1.0)),
+            )
+        )
+    return rows
+
+
+def fitted(rows: Sequence[Found]) -> dict[str, float]:
+    """Return the constants of `cloud` under which the errors of its averages are most likely, gaussian each."""
+    truth, light = np.array([row.truth for row in rows]), np.array([row.light for row in rows])
+    jackknife = np.array([np.trace(row.jackknife) / 2 for row in rows])
+    chance, dimness = (np.array([getattr(row, name) for row in rows]) for name in ("chance", "dimness"))
+
+    def cost(logs: Array) -> float:
+        aside, dimmer, own, factor, share = np.exp(logs)
+        spots = aside**2 + chance + dimmer**2 * dimness
+        other = own**2 + factor**2 * jackknife + share**2 * (light**2).sum(axis=1)
+        variance = spots * other / (spots + other)
+        gap = truth - (spots / (spots + other))[:, None] * light
+        return float(np.mean(np.log(variance) + (gap**2).sum(axis=1) / (2 * variance)))
+
+    start = np.log([math.radians(5.0), 1.0, math.radians(2.0), 1.0, 0.5])
+    aside, dimmer, own, factor, share = np.exp(minimize(cost, start, method="Nelder-Mead", options={"maxiter": 9999}).x)
+    degrees = {"aside": math.degrees(aside), "light": math.degrees(own)}
+    return {**degrees, "dimmer": dimmer, "jackknife": factor, "own_share": share}
+
+
+def main() -> None:
+    """Print a table for told and untold lights, by slope, by organ and over all; or the constants."""
+    parser = argparse.ArgumentParser(prog="python -m studies.clouds.organs", description=__doc__)
+    parser.add_argument("first", type=int, nargs="?", default=80000, metavar="FIRST_SEED")
+    parser.add_argument("many", type=int, nargs="?", default=12, metavar="FRAMES")
+    parser.add_argument("--fit", action="store_true")
+    parser.add_argument("--frames", type=Path, default=None, metavar="FOLDER")
+    asked = parser.parse_args()
+    drawn = frames(asked.first, asked.many, asked.frames or of_this_code(Path("reports/studies/organs")))
+    if asked.fit:
+        rows = [row for *_, frame in drawn for row in found_in(frame)]
+        print(f"{len(rows)} clouds:", ", ".join(f"{name} {value:.2f}" for name, value in fitted(rows).items()))
+        return
+    done = [Read(organ, slope, told, read(frame, told)) for organ, slope, _, frame in drawn for told in (True, False)]
+    print("| frames | n | answered | answers | median, deg | 95th percentile | mean radius | inside | wrong and sure |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for told, light in ((True, "light given"), (False, "not given")):
+        own = [each for each in done if each.told == told]
+        for slope in SLOPES_DEG:
+            print(line(f"{light}, {slope:g} deg", [each for each in own if each.slope_deg == slope]))
+        for organ in ORGANS:
+            print(line(f"{light}, {organ}", [each for each in own if each.organ == organ]))
+        print(line(f"{light}, all", own))
+
+
+if __name__ == "__main__":
+    main()
