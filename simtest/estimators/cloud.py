@@ -11,7 +11,7 @@ import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors, exactly
 from simtest.errors import Failure, Reason
-from simtest.estimators.budget import Budget, equivalent_covariance, total
+from simtest.estimators.budget import Budget, equivalent_covariance
 from simtest.estimators.cloud_light import DiffuseLight, find_spots
 from simtest.estimators.cloud_mixture import (
     CLUMPING,
@@ -39,7 +39,7 @@ OWN_SHARE = fitted_number("clouds.own_share")
 ASIDE = math.radians(fitted_number("clouds.aside"))
 DIMMER = fitted_number("clouds.dimmer")
 LEAST_GAIN = fitted_number("clouds.least_gain")
-MOST_RMS = math.radians(fitted_number("clouds.most_rms"))
+MOST_RMS = fitted_number("clouds.most_rms")
 BENDS, MOST_EXTENT = fitted_number("clouds.bends"), math.radians(fitted_number("clouds.most_extent"))
 
 TYPICAL_SLOPE, SLOPES = math.radians(9.0), (math.radians(3.0), math.radians(20.0))
@@ -272,19 +272,16 @@ def _on_tissue(
     weight = _positive(own - untold) @ np.linalg.inv(own + of_light + untold)
     rest, common = np.eye(2) - weight, np.eye(2) + weight
     parts = {"relief": rest @ own @ rest.T, "shape": weight @ of_light @ weight.T}
+    rms = math.degrees(math.sqrt(float(np.trace(parts["relief"] + parts["shape"]))))
+    if rms > MOST_RMS:
+        off, known = math.degrees(float(np.linalg.norm(turn))), f"its normal would be known to {rms:.1f} deg"
+        if doubted:
+            known += f"; the diffuse light says that the base is turned by {off:.0f} deg from facing the light there"
+        return _unstated(spots, known)
     if untold.any():
         parts["light_offset"] = common @ untold @ common.T
     moved, normal = _turned(cloud, weight @ turn, evidence.gains, _turns(priors))
     budget = _budget(moved, parts, priors)
-    rms = math.sqrt(float(np.trace(total(budget))))
-    if rms > MOST_RMS + math.sqrt(float(np.trace(untold))):
-        off, known = (
-            math.degrees(float(np.linalg.norm(turn))),
-            f"its normal would be known to {math.degrees(rms):.1f} deg",
-        )
-        if doubted:
-            known += f"; the diffuse light says that the base is turned by {off:.0f} deg from facing the light there"
-        return _unstated(spots, known)
     return moved, normal, budget, doubted
 
 
