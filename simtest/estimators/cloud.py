@@ -213,7 +213,7 @@ def _estimate(
 ) -> Estimate | Failure:
     """Return the estimate of one cloud, or why it says nothing of the base's normal.
 
-    `dimness`: log of the frame's densest cloud's density of spots over that of this one.
+    `dimness`: twice the log of the density of spots of the frame's densest cloud over that of this one.
     """
     independent = max(len(points_px) / CLUMPING, LEAST_INDEPENDENT)
     sampling = sampling_covariance(cloud, window, independent) * small_sample(independent)
@@ -228,7 +228,7 @@ def _estimate(
     else:
         normal, doubted = -cloud.centre, False
         bends = np.zeros((2, 2)) if priors.plane else _bends(cloud, camera.unproject(points_px))
-        budget = _budget(cloud, {"relief": sampling, "shape": bends}, priors)
+        budget = _budget(cloud, normal, {"relief": sampling, "shape": bends}, priors)
     lobe = LOBE_RAD2 if priors.lobe_curvature is None else exactly(1 / priors.lobe_curvature.mean)
     slope = slope_of(cloud.covariance, independent, lobe)
     shape = CloudShape(points_px, cloud.covariance, independent, cloud.seen, lobe, slope)
@@ -281,8 +281,9 @@ def _on_tissue(
     if untold.any():
         parts["light_offset"] = common @ untold @ common.T
     moved, normal = _turned(cloud, weight @ turn, evidence.gains, _turns(priors))
-    budget = _budget(moved, parts, priors)
-    return moved, normal, budget, doubted
+    across = basis_across(moved.centre) @ half.T
+    parts = {name: across @ part @ across.T for name, part in parts.items()}
+    return moved, normal, _budget(moved, normal, parts, priors), doubted
 
 
 def spots_covariance(cloud: Cloud, sampling: Array, evidence: BaseEvidence, dimness: float) -> Array:
@@ -350,9 +351,9 @@ def _bends(cloud: Cloud, sightlines: Array) -> Array:
     return np.asarray(max(excess, 0.0) * cloud.covariance)
 
 
-def _budget(cloud: Cloud, parts: dict[str, Array], priors: Priors) -> Budget:
-    """Return the budget of a cloud's normal: the parts of its centre, shape (2, 2), and the lights."""
-    normal, half = -cloud.centre, basis_across(cloud.centre)
+def _budget(cloud: Cloud, normal: Array, parts: dict[str, Array], priors: Priors) -> Budget:
+    """Return the budget of a cloud's normal: parts across its centre, shape (2, 2), and the lights."""
+    half = basis_across(cloud.centre)
     # The bases across a direction and its reverse are not the same.
     turn = basis_across(normal) @ half.T
     budget = {name: turn @ part @ turn.T for name, part in parts.items()}

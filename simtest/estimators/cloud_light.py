@@ -24,6 +24,7 @@ from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.geometry import Array, Image, Mask, smooth
 from simtest.geometry.patch import share_of_noise
 from simtest.geometry.vectors import basis_across
+from simtest.runtime.arrays import AnyArray
 
 SMOOTHING_PX = 0.7
 """Gaussian smoothing before maxima are looked for: that of a lens, so that one spot of noise is no maximum."""
@@ -261,26 +262,26 @@ class DiffuseLight:
     frame: Frame  # falloffs that its calibration knows are undone
 
     @cached_property
-    def _logs(self) -> tuple[Array, Mask, Mask, float]:
-        """Return logs of the channels, (h, w, C), where they are lit between the spots, and not clipped there.
-
-        The last is the share of pixels that are lit anywhere.
-        """
+    def _lit(self) -> tuple[AnyArray, Mask]:
+        """Return the channels, shape (h, w, C), and where they are lit in view, spots and all."""
         frame, cut = self.frame, (slice(None, None, STRIDE), slice(None, None, STRIDE))
-        encoded = frame.encoded if frame.encoded.ndim == 3 else frame.encoded[..., None]
-        light = frame.channels if frame.encoded.ndim == 3 else frame.channels[..., None]
-        gain = frame.corrected.gain
+        light, gain = frame.channels if frame.encoded.ndim == 3 else frame.channels[..., None], frame.corrected.gain
         values = light[cut] if gain is None else light[cut] * gain[cut][..., None]
         # The noise is that of the channels' mean.
         lit = values > LEAST_LIGHT * float(np.median(frame.noise)) * np.sqrt(light.shape[2])
-        anywhere = float(lit.any(axis=2).mean())
+        return values, np.asarray(lit if frame.seen is None else lit & frame.seen[cut][..., None])
+
+    @cached_property
+    def _logs(self) -> tuple[Array, Mask, Mask]:
+        """Return logs of the channels, shape (h, w, C), where they are lit between the spots, and not clipped there."""
+        frame, cut = self.frame, (slice(None, None, STRIDE), slice(None, None, STRIDE))
+        values, lit = self._lit
         margin = np.ones((2 * SPOT_MARGIN_PX + 1, 2 * SPOT_MARGIN_PX + 1), np.uint8)
-        lit &= ~(cv2.dilate(bright_parts(frame).astype(np.uint8), margin)[cut] > 0)[..., None]
-        if frame.seen is not None:
-            lit &= frame.seen[cut][..., None]
+        lit = lit & ~(cv2.dilate(bright_parts(frame).astype(np.uint8), margin)[cut] > 0)[..., None]
+        encoded = frame.encoded if frame.encoded.ndim == 3 else frame.encoded[..., None]
         level = frame.calibration.saturation_level
         unclipped = lit if level is None else lit & (encoded[cut] < level)
-        return np.log(np.maximum(values, 1e-9), dtype=np.float64), lit, unclipped, anywhere
+        return np.log(np.maximum(values, 1e-9), dtype=np.float64), lit, unclipped
 
     @cached_property
     def _sightlines(self) -> Array:
@@ -292,8 +293,8 @@ class DiffuseLight:
     @cached_property
     def shows(self) -> bool:
         """Whether the frame shows diffuse light: its base is tissue, not dark."""
-        _, lit, _, anywhere = self._logs
-        return bool(lit.any(axis=2).mean() > LEAST_LIT or anywhere > GLITTERING)
+        between, anywhere = (lit.any(axis=2).mean() for lit in (self._logs[1], self._lit[1]))
+        return bool(between > LEAST_LIT or anywhere > GLITTERING)
 
     def around(self, sightline: Array, covariance: Array) -> Shading | None:
         """Fit a quadric to the logarithm of the light around a sightline.
@@ -306,7 +307,7 @@ class DiffuseLight:
         reach = covariance + LEAST_EXTENT**2 * np.eye(2)
         radius2 = np.nan_to_num(np.einsum("ni,ij,nj->n", points, np.linalg.inv(reach), points), nan=np.inf)
         inside = np.flatnonzero(radius2 < REACH**2)
-        logs, _, sound, _ = self._logs
+        logs, _, sound = self._logs
         logs, sound = logs.reshape(-1, logs.shape[2])[inside], sound.reshape(-1, sound.shape[2])[inside]
         enough = np.flatnonzero(sound.sum(axis=0) >= max(LEAST_PIXELS, LEAST_SHARE * len(inside)))
         if not len(enough):

@@ -217,6 +217,23 @@ def test_a_normal_that_is_told_too_poorly_is_none(monkeypatch):
     assert math.degrees(math.sqrt(np.trace(untold.covariance))) > 7.5
 
 
+def test_parts_keep_their_directions_where_the_light_moves_a_cloud(monkeypatch):
+    """The light tells one direction poorly: it is the long one of the region, also where the move turns the basis."""
+    for name, value in (("OWN_SHARE", 0.0), ("MOST_RMS", 90.0), ("ASIDE", 1.0)):
+        monkeypatch.setattr(cloud_module, name, value)
+    facing, turn, along = direction(25.0, -10.0), np.array([0.0, -0.45]), np.array([1.0, 1.0]) / math.sqrt(2)
+    told = BaseEvidence(True, told=True, turn=turn, covariance=1e-4 * (np.eye(2) + 9 * np.outer(along, along)))
+    monkeypatch.setattr(cloud_module, "evidence_of", lambda *_: told)
+    points = points_around(facing, extent_px=8.0)
+    (found,) = estimates(frame_of(light_of_sphere(facing), points))
+    assert angle_deg(found.normal, -facing) > 15.0
+    long = np.linalg.eigh(found.covariance)[1][:, -1] @ basis_across(found.normal)
+    # As it lay at the cloud, in the plane across the normal now.
+    across = along @ basis_across(CAMERA.unproject(points.mean(axis=0)))
+    across -= found.normal * (found.normal @ across)
+    assert abs(long @ across) / np.linalg.norm(across) > math.cos(math.radians(1.5))
+
+
 def test_a_cloud_of_fewer_spots_than_the_densest_is_known_less_well():
     """A base that nowhere faces the lights glitters most where it comes nearest, but less than one that does."""
     extent, gain = math.radians(4.0), 2.0
