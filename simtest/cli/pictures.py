@@ -108,6 +108,8 @@ def _sequence(source: Path, out: Path, options: "Options") -> Told:
 
 def _record_parts(spots: "Specularities", image: Path) -> "Iterator[str | Table]":
     """Yield the best normals, what they state, what is assumed, and how many highlights have one."""
+    if spots.of_organ:
+        yield spots.of_organ
     yield from record_tables(spots)
     if spots.stated is not None:
         yield f"reported: {spots.stated}"
@@ -150,10 +152,11 @@ def _summary(spots: "Specularities") -> Table:
     from simtest.reconstruction.records import SIGHTLINE_RULE
 
     groups: dict[tuple[str, str], list[Specularity]] = {}
-    rule = spots.sightline_rule
+    rule, clouds = spots.sightline_rule, {spot.id for spot in spots.clouds}
     for spot in spots:
         best = SIGHTLINE_RULE if spot.best in rule else spot.best or "none"
-        groups.setdefault((kind_name(spot.kind), best), []).append(spot)
+        kind = "cloud" if spot.id in clouds else kind_name(spot.kind)
+        groups.setdefault((kind, best), []).append(spot)
     rows = []
     for (kind, best), held in sorted(groups.items(), key=lambda item: -len(item[1])):
         stated = [d for s in held if s.best_estimate and (d := s.best_estimate.deviation_deg) is not None]

@@ -6,18 +6,18 @@ gains move their centroid. The diffuse light does (`cloud_light`), as well as th
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors, exactly
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget, equivalent_covariance
-from simtest.estimators.cloud_light import DiffuseLight, find_spots
+from simtest.estimators.cloud_light import SECTORS, DiffuseLight, Spots, find_spots, spots_could_be_seen
 from simtest.estimators.cloud_mixture import (
     CLUMPING,
     LEAST_SEEN,
     Cloud,
-    Mixture,
     Turns,
     Window,
     at_camera,
@@ -28,7 +28,7 @@ from simtest.estimators.cloud_mixture import (
 from simtest.estimators.cloud_shape import LOBE_RAD2, CloudShape, slope_of
 from simtest.estimators.prior_parts import add_common_parts, light_offset_part, mean_light_part
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
-from simtest.geometry import Array, Camera
+from simtest.geometry import Array, Camera, Mask
 from simtest.geometry.vectors import basis_across
 from simtest.runtime import chi_squared
 from simtest.runtime.fitted import fitted_number
@@ -37,7 +37,7 @@ from simtest.runtime.statistics import CONFIDENCE
 LIGHT, JACKKNIFE = math.radians(fitted_number("clouds.light")), fitted_number("clouds.jackknife")
 OWN_SHARE = fitted_number("clouds.own_share")
 ASIDE = math.radians(fitted_number("clouds.aside"))
-DIMMER = fitted_number("clouds.dimmer")
+CHANCE, DIMMER = fitted_number("clouds.chance"), fitted_number("clouds.dimmer")
 LEAST_GAIN = fitted_number("clouds.least_gain")
 MOST_RMS = fitted_number("clouds.most_rms")
 BENDS, MOST_EXTENT = fitted_number("clouds.bends"), math.radians(fitted_number("clouds.most_extent"))
@@ -45,9 +45,6 @@ BENDS, MOST_EXTENT = fitted_number("clouds.bends"), math.radians(fitted_number("
 TYPICAL_SLOPE, SLOPES = math.radians(9.0), (math.radians(3.0), math.radians(20.0))
 """Of a relief, where nothing tells, and what is possible. The extent of one cloud tells it to a factor of 2 only, so it
 counts for half of the logarithm."""
-
-DOUBTED = 0.95
-"""Spots and diffuse light that differ by more than this quantile lets expect are flagged."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +86,9 @@ LEAST_SPOTS = 6
 LEAST_IN_VIEW, LEAST_VERIFIABLE = 0.95, 0.5
 """Nor does a cloud of which less is in view, whose centre would be a guess; on tissue the diffuse light tells more."""
 
+LEAST_SHOWN = 0.3
+"""Of a cloud whose density others are compared with."""
+
 LARGELY_SEEN = 0.98
 """A cloud of which less is in view is flagged."""
 
@@ -127,33 +127,27 @@ class CloudCentre:
 
         Each estimate has ``target`` base and a `cloud`. Flags: ``anisotropic_or_curved`` where the cloud is longer than
         wide, which a curved base and an anisotropic relief do alike; ``cut`` where a part of it is out of view;
-        ``wide`` where it is longer than `MOST_EXTENT`; ``base_doubted`` where the diffuse light says that the base is
-        likely turned from the lights at its centre; ``base_unverified`` where too little diffuse light is seen to tell;
+        ``wide`` where it is longer than `MOST_EXTENT`; ``base_unverified`` where no diffuse light is seen to tell;
         ``clouds_refused`` where another cloud of the frame gets no answer.
         The axis ratio, and the curvature's directions, hold for isotropic relief. Fails with ``no_estimate`` where no
-        cloud has spots enough in view, or none that has tells the normal to `MOST_RMS`, beside an untold light.
+        cloud has spots enough in view, or none that has tells the normal to `MOST_RMS`, beside an untold light, or
+        where the diffuse light says that the base is turned from the lights there.
         """
         spots = find_spots(frame)
         if len(spots.peaks) < self.least_spots:
             return self._too_few(len(spots.peaks))
-        turns, window = _turns(priors), window_of(camera, frame.seen)
-        mixture = fit_mixture(camera.unproject(spots.points_px), window, turns)
-        owner = np.where(mixture.belongs.sum(axis=1) > 0.5, mixture.belongs.argmax(axis=1), -1)
-        light, density = DiffuseLight(frame), max(map(density_of, mixture.clouds))
-        in_view = LEAST_VERIFIABLE if light.shows and not priors.plane else LEAST_IN_VIEW
-        estimates: list[Estimate] = []
-        refused: list[Failure] = []
-        for i, cloud in enumerate(mixture.clouds):
-            own = spots.points_px[owner == i]
-            if len(own) >= self.least_spots and cloud.seen >= in_view and _is_in_view(cloud, camera, frame):
-                dimness = 2 * math.log(max(density / density_of(cloud), 1.0))
-                made = _estimate(cloud, own, window, camera, priors, light, dimness)
+        groups = Groups.of(frame, spots, camera, priors)
+        light, estimates, refused = DiffuseLight(frame), list[Estimate](), list[Failure]()
+        least_seen = LEAST_VERIFIABLE if light.shows and not priors.plane else LEAST_IN_VIEW
+        for cloud, own in zip(groups.clouds, groups.spots, strict=True):
+            if len(own.peaks) >= self.least_spots and cloud.seen >= least_seen and groups.shows(cloud):
+                made = _estimate(cloud, own, groups, priors, light)
                 if isinstance(made, Failure):
                     refused.append(made)
                 else:
                     estimates.append(made)
         if not estimates:
-            return refused[0] if refused else self._none_whole(mixture, owner, in_view)
+            return refused[0] if refused else self._none_whole(groups, least_seen)
         if refused:
             estimates = [replace(each, flags=(*each.flags, "clouds_refused")) for each in estimates]
         return sorted(estimates, key=lambda estimate: -len(_shape(estimate).points_px))
@@ -162,14 +156,14 @@ class CloudCentre:
         what = "1 bright spot" if count == 1 else f"{count} bright spots"
         return Failure(Reason.NO_ESTIMATE, f"{what}: a cloud takes {self.least_spots}; a lone highlight is none")
 
-    def _none_whole(self, mixture: Mixture, owner: Array, in_view: float) -> Failure:
-        counts = [int(np.count_nonzero(owner == i)) for i in range(len(mixture.clouds))]
+    def _none_whole(self, groups: "Groups", least_seen: float) -> Failure:
+        counts = [len(own.peaks) for own in groups.spots]
         largest = int(np.argmax(counts))
-        seen = 100 * mixture.clouds[largest].seen
+        seen = 100 * groups.clouds[largest].seen
         return Failure(
             Reason.NO_ESTIMATE,
             f"the largest cloud has {counts[largest]} spots and {seen:.0f} % of it in view: it takes "
-            f"{self.least_spots}, {100 * in_view:.0f} %, and its centre in view",
+            f"{self.least_spots}, {100 * least_seen:.0f} %, and its centre in view",
         )
 
 
@@ -179,6 +173,53 @@ cloud = CloudCentre()
 def _shape(estimate: Estimate) -> CloudShape:
     assert estimate.cloud is not None
     return estimate.cloud
+
+
+@dataclass(frozen=True)
+class Groups:
+    """The spots of a frame as clouds."""
+
+    camera: Camera
+    window: Window
+    seen: Mask | None  # (H, W): the view; None: all of the frame
+    clouds: tuple[Cloud, ...]
+    spots: tuple[Spots, ...]  # of each cloud
+
+    @classmethod
+    def of(cls, frame: Frame, spots: Spots, camera: Camera, priors: Priors) -> "Groups":
+        """Group spots into clouds.
+
+        The share of an area that glints goes as the density of slopes, the number of its glints does not: bright ones
+        merge. So each spot counts by its area.
+        """
+        window, weights = window_of(camera, spots_could_be_seen(frame)), spots.areas_px / spots.areas_px.mean()
+        mixture = fit_mixture(camera.unproject(spots.points_px), window, _turns(priors), weights)
+        owner = np.where(mixture.belongs.sum(axis=1) > 0.5, mixture.belongs.argmax(axis=1), -1)
+        own = tuple(spots.of(owner == i) for i in range(len(mixture.clouds)))
+        return cls(camera, window, frame.seen, mixture.clouds, own)
+
+    def shows(self, cloud: Cloud) -> bool:
+        """Return whether the pixel that a cloud's estimate looks at is in the view."""
+        look_px = self.camera.project(cloud.sightline)
+        if not (np.isfinite(look_px).all() and self.camera.contains(look_px)):
+            return False
+        size = self.camera.width, self.camera.height
+        column, row = (min(int(v), most - 1) for v, most in zip(look_px, size, strict=True))
+        return self.seen is None or bool(self.seen[row, column])
+
+    @cached_property
+    def _densest(self) -> float:
+        """The density of the densest cloud that has spots enough and is seen enough to tell it; 0 if there is none."""
+        told = [
+            density_of(cloud)
+            for cloud, own in zip(self.clouds, self.spots, strict=True)
+            if len(own.peaks) >= LEAST_SPOTS and cloud.seen >= LEAST_SHOWN
+        ]
+        return max(told, default=0.0)
+
+    def dimness(self, cloud: Cloud) -> float:
+        """Return twice the log of the density of spots of the densest cloud over that of this one, at least 0."""
+        return 2 * math.log(max(self._densest / density_of(cloud), 1.0))
 
 
 def density_of(cloud: Cloud) -> float:
@@ -199,39 +240,26 @@ def _is_at_camera(priors: Priors) -> bool:
     return not len(priors.lights) or not np.linalg.norm(priors.lights, axis=1).max() > 0
 
 
-def _is_in_view(cloud: Cloud, camera: Camera, frame: Frame) -> bool:
-    """Return whether the pixel that a cloud's estimate looks at is in the view."""
-    look_px = camera.project(cloud.sightline)
-    if not (np.isfinite(look_px).all() and camera.contains(look_px)):
-        return False
-    column, row = (min(int(v), size - 1) for v, size in zip(look_px, (camera.width, camera.height), strict=True))
-    return frame.seen is None or bool(frame.seen[row, column])
-
-
-def _estimate(
-    cloud: Cloud, points_px: Array, window: Window, camera: Camera, priors: Priors, light: DiffuseLight, dimness: float
-) -> Estimate | Failure:
-    """Return the estimate of one cloud, or why it says nothing of the base's normal.
-
-    `dimness`: twice the log of the density of spots of the frame's densest cloud over that of this one.
-    """
-    independent = max(len(points_px) / CLUMPING, LEAST_INDEPENDENT)
-    sampling = sampling_covariance(cloud, window, independent) * small_sample(independent)
+def _estimate(cloud: Cloud, spots: Spots, groups: Groups, priors: Priors, light: DiffuseLight) -> Estimate | Failure:
+    """Return the estimate of one cloud, or why it says nothing of the base's normal."""
+    camera, count = groups.camera, len(spots.points_px)
+    independent = max(count / CLUMPING, LEAST_INDEPENDENT)
+    sampling = sampling_covariance(cloud, groups.window, independent) * small_sample(independent)
     evidence = BaseEvidence(False) if priors.plane else evidence_of(cloud, light, priors)
     if evidence.shows:
-        made = _on_tissue(cloud, sampling, evidence, dimness, len(points_px), priors)
+        made = _on_tissue(cloud, sampling, evidence, groups.dimness(cloud), count, priors)
         if isinstance(made, Failure):
             return made
-        cloud, normal, budget, doubted = made
-        if not _is_in_view(cloud, camera, light.frame):
-            return _unstated(len(points_px), "the diffuse light says that its centre lies out of view")
+        cloud, normal, budget = made
+        if not groups.shows(cloud):
+            return _unstated(count, "the diffuse light says that its centre lies out of view")
     else:
-        normal, doubted = -cloud.centre, False
-        bends = np.zeros((2, 2)) if priors.plane else _bends(cloud, camera.unproject(points_px))
+        normal = -cloud.centre
+        bends = np.zeros((2, 2)) if priors.plane else _bends(cloud, camera.unproject(spots.points_px), spots)
         budget = _budget(cloud, normal, {"relief": sampling, "shape": bends}, priors)
     lobe = LOBE_RAD2 if priors.lobe_curvature is None else exactly(1 / priors.lobe_curvature.mean)
     slope = slope_of(cloud.covariance, independent, lobe)
-    shape = CloudShape(points_px, cloud.covariance, independent, cloud.seen, lobe, slope)
+    shape = CloudShape(spots.points_px, cloud.covariance, independent, cloud.seen, lobe, slope)
     # The cloud is longest where the gain is smallest.
     vectors = np.linalg.eigh(cloud.covariance)[1][:, ::-1].T @ basis_across(cloud.centre)
     estimate = Estimate(
@@ -240,7 +268,7 @@ def _estimate(
         look_px=camera.project(cloud.sightline),
         axis_ratio=shape.axis_ratio,
         budget=budget,
-        flags=_flags(cloud, shape, evidence, doubted, priors),
+        flags=_flags(cloud, shape, evidence, priors),
         curvature=EstimatedCurvature(vectors, shape.axis_ratio),
         target="base",
         cloud=shape,
@@ -250,52 +278,51 @@ def _estimate(
 
 def _on_tissue(
     cloud: Cloud, sampling: Array, evidence: BaseEvidence, dimness: float, spots: int, priors: Priors
-) -> tuple[Cloud, Array, Budget, bool] | Failure:
-    """Return a cloud on tissue moved to the base's highlight point, its normal, its budget, and whether it is doubted.
+) -> tuple[Cloud, Array, Budget] | Failure:
+    """Return a cloud on tissue moved to the base's highlight point, its normal and its budget.
 
     The spots say that the base faces the lights at the centre, the diffuse light how far it is turned there: both are
     averaged, weighted by their covariances. Where the gain allows it the centre moves to where the base faces the
     lights; along directions of a smaller gain the normal turns in its place.
     """
-    if not evidence.told:
-        return _unstated(spots, "too little diffuse light is seen there to tell whether the base faces the light")
     half, turn = basis_across(cloud.centre), evidence.turn
-    own, untold = spots_covariance(cloud, sampling, evidence, dimness), np.zeros((2, 2))
+    own, untold = spots_covariance(cloud, sampling, dimness), np.zeros((2, 2))
     if not priors.lights_mm:
         across = half @ basis_across(-cloud.centre).T
         untold = across @ light_offset_part(-cloud.centre, priors) @ across.T
     # A light beside the camera turns the normal at the spots by half of its angle, and the light by all of it.
-    gap = own + evidence.covariance + untold
-    doubted = float(turn @ np.linalg.solve(gap, turn)) > chi_squared.quantile(DOUBTED, 2)
+    gap = own + small_sample(SECTORS) * evidence.covariance + untold
+    if float(turn @ np.linalg.solve(gap, turn)) > chi_squared.quantile(CONFIDENCE, 2):
+        off = math.degrees(float(np.linalg.norm(turn)))
+        return _unstated(
+            spots, f"the diffuse light says that the base is turned by {off:.0f} deg from facing the light"
+        )
     # Far from facing the light its logarithm is no quadric.
     of_light = evidence.covariance + OWN_SHARE**2 * float(turn @ turn) * np.eye(2)
-    weight = _positive(own - untold) @ np.linalg.inv(own + of_light + untold)
+    weight = _positive(own - untold) @ np.linalg.inv(own + of_light + untold) if evidence.told else np.zeros((2, 2))
     rest, common = np.eye(2) - weight, np.eye(2) + weight
     parts = {"relief": rest @ own @ rest.T, "shape": weight @ of_light @ weight.T}
     rms = math.degrees(math.sqrt(float(np.trace(parts["relief"] + parts["shape"]))))
     if rms > MOST_RMS:
-        off, known = math.degrees(float(np.linalg.norm(turn))), f"its normal would be known to {rms:.1f} deg"
-        if doubted:
-            known += f"; the diffuse light says that the base is turned by {off:.0f} deg from facing the light there"
-        return _unstated(spots, known)
+        return _unstated(spots, f"its normal would be known to {rms:.1f} deg")
     if untold.any():
         parts["light_offset"] = common @ untold @ common.T
     moved, normal = _turned(cloud, weight @ turn, evidence.gains, _turns(priors))
     across = basis_across(moved.centre) @ half.T
     parts = {name: across @ part @ across.T for name, part in parts.items()}
-    return moved, normal, _budget(moved, normal, parts, priors), doubted
+    return moved, normal, _budget(moved, normal, parts, priors)
 
 
-def spots_covariance(cloud: Cloud, sampling: Array, evidence: BaseEvidence, dimness: float) -> Array:
+def spots_covariance(cloud: Cloud, sampling: Array, dimness: float) -> Array:
     """Return the covariance of the base's turn at a cloud's centre as the spots tell it, shape (2, 2), rad^2.
 
     By the number of spots; by changes of curvature and folds; and since a base that nowhere faces the lights still
     glitters most where it comes nearest: by sqrt(2 ln(A_max / A)) of the relief's slope, A the density of spots.
     """
-    spread = evidence.gains @ cloud.covariance @ evidence.gains.T
-    slope = math.sqrt(TYPICAL_SLOPE * min(max(math.sqrt(float(np.trace(spread)) / 2), SLOPES[0]), SLOPES[1]))
+    extent = math.sqrt(float(np.trace(cloud.covariance)) / 2)
+    slope = math.sqrt(TYPICAL_SLOPE * min(max(extent, SLOPES[0]), SLOPES[1]))
     relative = np.linalg.solve(cloud.covariance, sampling)
-    share = float(np.trace(relative)) / 2 + DIMMER**2 * dimness
+    share = CHANCE**2 * float(np.trace(relative)) / 2 + DIMMER**2 * dimness
     return (ASIDE**2 + slope**2 * share) * np.eye(2)
 
 
@@ -333,7 +360,7 @@ def _extent(cloud: Cloud) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(cloud.covariance)[-1]))
 
 
-def _bends(cloud: Cloud, sightlines: Array) -> Array:
+def _bends(cloud: Cloud, sightlines: Array, spots: Spots) -> Array:
     """Return the covariance of a cloud's centre by changes of the base's gains inside it, shape (2, 2), rad^2.
 
     Where the density of spots is p(w), w the base's misfit and quadratic in x, the centroid is off by half of
@@ -341,12 +368,14 @@ def _bends(cloud: Cloud, sightlines: Array) -> Array:
     of 2 / N along each direction and is taken off. Tissue bends by `BENDS` at least, shown or not.
     """
     points, _ = cloud.coordinates(sightlines)
-    points = points[np.isfinite(points).all(axis=1)]
+    front = np.asarray(np.isfinite(points).all(axis=1))
+    points, spots = points[front], spots.of(front)
     if len(cloud.turns) > 1 or len(points) < LEAST_SPOTS:
         return np.asarray(BENDS**2 * cloud.covariance)
-    gap = points - points.mean(axis=0)
-    x = np.linalg.solve(np.linalg.cholesky(gap.T @ gap / len(gap)), gap.T)
-    off = (x * (x**2).sum(axis=0)).mean(axis=1) / 2
+    weights = spots.areas_px / spots.areas_px.sum()
+    gap = points - weights @ points
+    x = np.linalg.solve(np.linalg.cholesky((weights * gap.T) @ gap), gap.T)
+    off = (x * (x**2).sum(axis=0)) @ weights / 2
     excess = float(off @ off) / 2 - 2 * CLUMPING / len(points)
     return np.asarray(max(excess, 0.0) * cloud.covariance)
 
@@ -388,7 +417,7 @@ def small_sample(independent: float) -> float:
     return 2 * (independent - 1) / rest * F / chi_squared.quantile(CONFIDENCE, 2)
 
 
-def _flags(cloud: Cloud, shape: CloudShape, evidence: BaseEvidence, doubted: bool, priors: Priors) -> tuple[str, ...]:
+def _flags(cloud: Cloud, shape: CloudShape, evidence: BaseEvidence, priors: Priors) -> tuple[str, ...]:
     flags = []
     if _is_long(cloud.covariance, shape.independent):
         flags.append("anisotropic_or_curved")
@@ -397,8 +426,6 @@ def _flags(cloud: Cloud, shape: CloudShape, evidence: BaseEvidence, doubted: boo
     if not priors.plane:
         if _extent(cloud) > MOST_EXTENT:
             flags.append("wide")
-        if doubted:
-            flags.append("base_doubted")
-        elif not evidence.told:
+        if not evidence.told:
             flags.append("base_unverified")
     return tuple(flags)

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 
 from simtest.calibration import Frame
+from simtest.calibration.frame import median
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.geometry import Array, Image, Mask, smooth
 from simtest.geometry.patch import share_of_noise
@@ -66,6 +67,10 @@ class Spots:
     areas_px: Array  # (N,): number of pixels above half of its peak, or above the saddle where that is higher
     peaks: Array  # (N,): light at the peak above the background, frame units
 
+    def of(self, kept: Mask) -> "Spots":
+        """Return some of the spots."""
+        return Spots(self.points_px[kept], self.areas_px[kept], self.peaks[kept])
+
 
 def find_spots(frame: Frame) -> Spots:
     """Find the bright spots of a frame.
@@ -90,8 +95,22 @@ def find_spots(frame: Frame) -> Spots:
     spots = _maxima(above, brightest_near, brightest, max(least, brightest * STEP**LEVELS))
     if not len(spots.peaks):
         return spots
-    kept = spots.peaks >= FAINTEST * np.quantile(spots.peaks, BRIGHT_QUANTILE)
-    return Spots(spots.points_px[kept], spots.areas_px[kept], spots.peaks[kept])
+    last = len(spots.peaks) - 1
+    # NumPy's quantile loads masked arrays, which nothing else needs; the peaks are sorted already.
+    bright = np.interp((1 - BRIGHT_QUANTILE) * last, np.arange(last + 1), spots.peaks)
+    kept = spots.peaks >= FAINTEST * bright
+    return spots.of(kept)
+
+
+def spots_could_be_seen(frame: Frame) -> Mask | None:
+    """Return where a bright spot could be seen, shape (H, W): in view, and not on ground that is burnt out."""
+    level, response, gain = frame.calibration.saturation_level, frame.calibration.response, frame.corrected.gain
+    if level is None:
+        return frame.seen
+    most = level if response is None else float(response.decode(np.array([level]))[0])
+    ground, near = _background(_tissue(frame))
+    shows = ground + LEAST_CONTRAST * near <= (most if gain is None else most * gain)
+    return np.asarray(shows if frame.seen is None else shows & frame.seen)
 
 
 def bright_parts(frame: Frame) -> Mask:
@@ -110,11 +129,16 @@ def _above(frame: Frame) -> tuple[Image, Mask]:
 
 def _light(frame: Frame) -> tuple[Image, float]:
     """Return the light in which spots are looked for, smoothed, shape (H, W), and the noise that is left in it."""
-    noise = float(np.median(frame.noise)) * share_of_noise(SMOOTHING_PX)
+    noise = _level(frame) * share_of_noise(SMOOTHING_PX)
     if frame.light is None and frame.encoded.ndim == 3:
         # The noise of the mean is known; the minimum has about that of one channel.
         return _tissue(frame), noise * float(np.sqrt(frame.encoded.shape[2]))
     return smooth(frame.corrected.intensity, SMOOTHING_PX, frame.seen), noise
+
+
+def _level(frame: Frame) -> float:
+    """Return the median noise of a frame."""
+    return float(median(np.ravel(frame.noise)))
 
 
 def _tissue(frame: Frame) -> Image:
@@ -223,7 +247,7 @@ LEAST_PIXELS, LEAST_SHARE = 60, 0.12
 """Fewer pixels between the spots, or a smaller share of all, tell nothing."""
 
 MOST_MISSING = 0.05
-"""Another channel tells the hue where it misses no larger share of these pixels."""
+"""Of these pixels a channel that is fitted is clipped at no more, and another one that tells the hue lacks no more."""
 
 LEAST_LIGHT = 5.0
 """Light below so many standard deviations of the noise is dark."""
@@ -268,7 +292,7 @@ class DiffuseLight:
         light, gain = frame.channels if frame.encoded.ndim == 3 else frame.channels[..., None], frame.corrected.gain
         values = light[cut] if gain is None else light[cut] * gain[cut][..., None]
         # The noise is that of the channels' mean.
-        lit = values > LEAST_LIGHT * float(np.median(frame.noise)) * np.sqrt(light.shape[2])
+        lit = values > LEAST_LIGHT * _level(frame) * np.sqrt(light.shape[2])
         return values, np.asarray(lit if frame.seen is None else lit & frame.seen[cut][..., None])
 
     @cached_property
@@ -307,13 +331,16 @@ class DiffuseLight:
         reach = covariance + LEAST_EXTENT**2 * np.eye(2)
         radius2 = np.nan_to_num(np.einsum("ni,ij,nj->n", points, np.linalg.inv(reach), points), nan=np.inf)
         inside = np.flatnonzero(radius2 < REACH**2)
-        logs, _, sound = self._logs
-        logs, sound = logs.reshape(-1, logs.shape[2])[inside], sound.reshape(-1, sound.shape[2])[inside]
+        logs, *masks = self._logs
+        logs = logs.reshape(-1, logs.shape[2])[inside]
+        lit, sound = (mask.reshape(-1, mask.shape[2])[inside] for mask in masks)
         enough = np.flatnonzero(sound.sum(axis=0) >= max(LEAST_PIXELS, LEAST_SHARE * len(inside)))
         if not len(enough):
             return None
-        # The brightest channel, red, is the one that blood changes least.
-        main = enough[np.argmax([np.median(logs[sound[:, c], c]) for c in enough])]
+        # The brightest channel, red, is the one that blood changes least; but what clipping leaves of it is flat.
+        clipped = 1 - sound.sum(axis=0)[enough] / lit.sum(axis=0)[enough]
+        whole = enough[clipped <= max(MOST_MISSING, float(clipped.min()))]
+        main = whole[np.argmax([median(logs[sound[:, c], c]) for c in whole])]
         others = [c for c in enough if c != main and sound[sound[:, main], c].mean() > 1 - MOST_MISSING]
         kept = sound[:, [main, *others]].all(axis=1)
         # Albedo changes the ratios of the channels, shading does not.
@@ -333,7 +360,7 @@ def _fitted(points: Array, radius2: Array, values: Array, hues: Array) -> Shadin
     for _ in range(STEPS):
         solution = _solved(A, weights, values)
         gaps = values - A @ solution
-        spread = 1.48 * float(np.median(np.abs(gaps))) + 1e-9
+        spread = 1.48 * float(median(np.abs(gaps))) + 1e-9
         weights = near / (1 + (gaps / (OUTLYING * spread)) ** 2)
     sector = ((np.arctan2(y, x) / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
     without = [_solved(A[sector != i], weights[sector != i], values[sector != i]) for i in range(SECTORS)]

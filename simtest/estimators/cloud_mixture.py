@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from simtest.calibration.frame import median
 from simtest.geometry import Array, Camera, Mask
 from simtest.geometry.vectors import basis_across
 
@@ -147,16 +148,19 @@ class Mixture:
     score: float
 
 
-def fit_mixture(sightlines: Array, window: Window, turns: Turns = at_camera) -> Mixture:
+def fit_mixture(sightlines: Array, window: Window, turns: Turns = at_camera, weights: Array | None = None) -> Mixture:
     """Fit as many clouds as the spots tell apart, at least one.
 
-    `sightlines`, (N, 3): unit, of the spots; `window`: the view; `turns`: where each light has its part of a cloud.
+    `sightlines`, (N, 3): unit, of the spots; `window`: the view; `turns`: where each light has its part of a cloud;
+    `weights`, (N,): how many independent spots each counts for, default one.
     """
-    best = current = _fit([_cloud_of(sightlines, turns)], sightlines, window, turns)
+    if weights is None:
+        weights = np.ones(len(sightlines))
+    best = current = _fit([_cloud_of(sightlines, weights, turns)], sightlines, weights, window, turns)
     while len(current.clouds) < MOST_CLOUDS:
         # Split each cloud in turn, and keep the best of the mixtures with one more.
-        starts = [_split(current, i, sightlines, turns) for i in range(len(current.clouds))]
-        tries = [_fit(start, sightlines, window, turns) for start in starts if start is not None]
+        starts = [_split(current, i, sightlines, weights, turns) for i in range(len(current.clouds))]
+        tries = [_fit(start, sightlines, weights, window, turns) for start in starts if start is not None]
         if not tries:
             break
         current = max(tries, key=lambda mixture: mixture.score)
@@ -167,16 +171,18 @@ def fit_mixture(sightlines: Array, window: Window, turns: Turns = at_camera) -> 
     return best
 
 
-def _cloud_of(sightlines: Array, turns: Turns, share: float = 1.0) -> Cloud:
+def _cloud_of(sightlines: Array, weights: Array, turns: Turns, share: float = 1.0) -> Cloud:
     """Return the cloud of spots that all belong to it and are all that there is."""
-    mean = sightlines.sum(axis=0)
+    mean = weights @ sightlines
     centre = mean / np.linalg.norm(mean)
     # The spots' mean is that of the lights' parts.
     shifted = centre - turns(centre).mean(axis=0) @ basis_across(centre)
     cloud = Cloud(shifted / np.linalg.norm(shifted), np.eye(2) * TYPICAL**2, turns(centre), share)
     points, _ = cloud.coordinates(sightlines)
-    points = points[np.isfinite(points).all(axis=1)] - cloud.turns.mean(axis=0)
-    return replace(cloud, covariance=_sound(points.T @ points - len(points) * cloud.spread, len(points)))
+    front = _sound_rows(points)
+    points, weights = points[front] - cloud.turns.mean(axis=0), weights[front]
+    count = float(weights.sum())
+    return replace(cloud, covariance=_sound((weights * points.T) @ points - count * cloud.spread, count))
 
 
 def _sound(square: Array, count: float) -> Array:
@@ -186,7 +192,7 @@ def _sound(square: Array, count: float) -> Array:
     return np.asarray(vectors @ np.diag(np.maximum(values, LEAST_EXTENT**2)) @ vectors.T)
 
 
-def _split(mixture: Mixture, index: int, sightlines: Array, turns: Turns) -> list[Cloud] | None:
+def _split(mixture: Mixture, index: int, sightlines: Array, weights: Array, turns: Turns) -> list[Cloud] | None:
     """Return the clouds with one of them cut in two across its longest direction; None where it holds too few."""
     points, _ = mixture.clouds[index].coordinates(sightlines)
     own = (mixture.belongs.argmax(axis=1) == index) & np.isfinite(points).all(axis=1)
@@ -194,17 +200,17 @@ def _split(mixture: Mixture, index: int, sightlines: Array, turns: Turns) -> lis
         return None
     cloud = mixture.clouds[index]
     coordinate = points @ np.linalg.eigh(cloud.covariance + cloud.spread)[1][:, 1]
-    upper = coordinate > np.median(coordinate[own])
+    upper = coordinate > median(coordinate[own])
     halves = [own & upper, own & ~upper]
     if min(np.count_nonzero(half) for half in halves) < LEAST_HALF:
         return None
-    parts = [_cloud_of(sightlines[half], turns, cloud.share / 2) for half in halves]
+    parts = [_cloud_of(sightlines[half], weights[half], turns, cloud.share / 2) for half in halves]
     return [other for i, other in enumerate(mixture.clouds) if i != index] + parts
 
 
-def _fit(clouds: list[Cloud], sightlines: Array, window: Window, turns: Turns) -> Mixture:
+def _fit(clouds: list[Cloud], sightlines: Array, weights: Array, window: Window, turns: Turns) -> Mixture:
     """Fit clouds from a start by expectation and maximisation."""
-    stray, last, total, count = FIRST_STRAY, -np.inf, sum(cloud.share for cloud in clouds), len(sightlines)
+    stray, last, total, count = FIRST_STRAY, -np.inf, sum(cloud.share for cloud in clouds), float(weights.sum())
     clouds = [replace(cloud, share=(1 - stray) * cloud.share / total) for cloud in clouds]
     for step in range(STEPS + 1):
         # expectation, by densities of what is seen; it comes last too, so that all that is returned is of one fit
@@ -212,18 +218,20 @@ def _fit(clouds: list[Cloud], sightlines: Array, window: Window, turns: Turns) -
         seen = [min(max(float(part.sum()), LEAST_SEEN), 1.0) for part in inside]
         joint = [c.share * c.densities(sightlines) / z for c, z in zip(clouds, seen, strict=True)]
         whole = sum(part.sum(axis=1) for part in joint) + stray / window.total
-        value = float(np.log(whole).sum())
+        value = float(weights @ np.log(whole))
         if value - last < CLOSE * count or step == STEPS:
             break
         last = value
         # maximisation
-        belongs = [part / whole[:, None] for part in joint]
+        belongs = [part * (weights / whole)[:, None] for part in joint]
         stray = max(1 - sum(float(part.sum()) for part in belongs) / count, LEAST_STRAY)
         clouds = [
             _moved(cloud, part, count, sightlines, window, cells, turns)
             for cloud, part, cells in zip(clouds, belongs, inside, strict=True)
         ]
-    score = value / CLUMPING - PARAMETERS / 2 * len(clouds) * math.log(max(count / CLUMPING, 2.0))
+    # As many equal spots tell as much as these do.
+    equal = count**2 / float(weights @ weights) / CLUMPING
+    score = value * equal / count - PARAMETERS / 2 * len(clouds) * math.log(max(equal, 2.0))
     # The prior on the extents keeps a cloud from shrinking onto a few spots.
     score += sum(_prior(cloud) for cloud in clouds)
     finished = tuple(replace(cloud, seen=z) for cloud, z in zip(clouds, seen, strict=True))
@@ -237,7 +245,7 @@ def _prior(cloud: Cloud) -> float:
 
 
 def _moved(
-    cloud: Cloud, belongs: Array, total: int, sightlines: Array, window: Window, inside: Array, turns: Turns
+    cloud: Cloud, belongs: Array, total: float, sightlines: Array, window: Window, inside: Array, turns: Turns
 ) -> Cloud:
     """Return a cloud after one step: by the moments of its spots and of the part of it that is out of view.
 

@@ -149,7 +149,7 @@ NEGLIGIBLE = 0.1  # a squared error below this share of the stated variance is l
 SPOT_SPREAD = math.radians(fitted_number("spots_on_relief.spread"))
 SPOT_ONSET = math.radians(fitted_number("spots_on_relief.onset"))
 
-STEEPER = fitted_number("steeper.share")
+STEEPER, FADES = fitted_number("steeper.share"), math.radians(fitted_number("steeper.fades"))
 """Highlights lie where a surface bends (theory.md 7.1), and pits and ridges are steep where they bend: all glints by
 1.07 (colon), 1.80 (liver) and 2.42 times (stomach; `studies.clouds.glint_slope`). A view that cuts a cloud may also
 show its steep side alone. A plane shows the whole cloud of a relief that is alike everywhere, so that it is 1 there."""
@@ -356,7 +356,7 @@ def to_base(estimate: Estimate, relief: Array) -> Estimate:
 
 def relief_part(priors: Priors) -> Array:
     """Return the covariance of a single highlight's normal about the base's, shape (2, 2), rad^2."""
-    return _slope_variance(priors.relief_slope, 1.0 if priors.plane else STEEPER) * np.eye(2)
+    return _slope_variance(priors.relief_slope, priors.plane) * np.eye(2)
 
 
 def _with_told_lights(estimate: Estimate, priors: Priors) -> Estimate:
@@ -375,14 +375,15 @@ def _with_told_lights(estimate: Estimate, priors: Priors) -> Estimate:
 
 
 @lru_cache(maxsize=16)
-def _slope_variance(slope: Distribution, steeper: float) -> float:
+def _slope_variance(slope: Distribution, plane: bool) -> float:
     """Return the equivalent variance an axis of highlights' slopes, whose standard deviation follows from a prior.
 
-    Of these pairs the share exp(-r^2 / 2 s^2) lies beyond r. The slopes are `steeper` times those of the surface.
+    Of these pairs the share exp(-r^2 / 2 s^2) lies beyond r. Off a plane their slopes are steeper than the surface's.
     """
     s = slope.quantile(SHARES)
     if not s.max() > 0:
         return 0.0
+    steeper = 1.0 if plane else STEEPER / np.hypot(1, s / FADES)
     s = np.hypot(steeper * s, SPOT_SPREAD * np.sqrt(-np.expm1(-((s / SPOT_ONSET) ** 2))))
     low, high = 0.0, 10 * float(s.max())
     # bisection for the radius that 5 % exceed

@@ -14,7 +14,6 @@ FLAGS = {
     "ambiguous": "the two candidates of the circle pose are hardly told apart: a margin below 2 standard deviations",
     "ambiguous_light": "the data do not tell which of several lights made the highlight; their mean position is used",
     "anisotropic_or_curved": "the cloud is longer than wide: the base is curved, or the relief has a direction",
-    "base_doubted": "the diffuse light says that the base is likely turned away from the lights at the cloud's centre",
     "base_unverified": "too little diffuse light is seen to check the cloud's centre against it",
     "clouds_refused": "another cloud of this picture got no answer",
     "cut": "a part of the cloud is out of view",

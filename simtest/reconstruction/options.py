@@ -34,6 +34,9 @@ from simtest.runtime.boundary import shown
 AUTO = "auto"
 ENCODINGS = ("srgb", "linear")
 TARGETS = ("fine", "base")
+CLOUD = "cloud"
+"""Name of the estimator of the organ's normal, which runs by default on a whole picture."""
+
 DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis", "curved")
 MAX_SMOOTHING_PX = 50
 
@@ -233,6 +236,9 @@ def choose(
     estimators = options.estimators
     if estimators is None:
         estimators = default_estimators(known) if is_picture else DEFAULT_ESTIMATORS
+        # A part of a picture holds no cloud that could be told.
+        if is_picture and options.roi is None:
+            estimators = (*estimators, CLOUD)
     # Values that nobody called encoded are taken as linear: that is the rule for real numbers, and no guess.
     encoding = options.encoding if is_picture else options.encoding or "linear"
     stated = {

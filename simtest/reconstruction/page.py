@@ -63,10 +63,10 @@ def write_picture_page(path: Path, spots: Specularities, picture: Image) -> None
     height, width = picture.shape[:2]
     best, stated = Counter(spot.best for spot in spots if spot.best), spots.stated
     parts = {} if stated is None else stated.shown_parts_deg
-    clouds = any(each.cloud is not None for spot in spots for each in spot.normals.values())
+    clouds = bool(spots.clouds)
     write_page(
         path, "picture.html.j2", data, record=spots, stated=stated, organ=spots.stated_of_organ,
-        rule=spots.sightline_rule, rule_note=spots.rule_note,
+        of_organ=spots.of_organ, rule=spots.sightline_rule, rule_note=spots.rule_note,
         told=list(parts.items()), picture=_address(picture),
         title=Path(spots.image).name, width=width, height=height, palette=palette, best=best,
         answered=sum(best.values()), clouds=clouds, terms=explanations.TERMS,

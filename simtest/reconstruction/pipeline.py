@@ -24,7 +24,7 @@ from simtest.geometry import Camera, Patch
 from simtest.geometry.patch import share_of_noise
 from simtest.reconstruction.assumptions import border_note, calibration_of_view
 from simtest.reconstruction.images import check_frame, check_size, image_size
-from simtest.reconstruction.options import SMOOTHING_BY_COLOUR_PX, Options, check_encoding, choose
+from simtest.reconstruction.options import CLOUD, SMOOTHING_BY_COLOUR_PX, Options, check_encoding, choose
 from simtest.reconstruction.records import Specularities, Specularity
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.boundary import plain_errors
@@ -167,8 +167,9 @@ def run(image: Image, calibration: Calibration, options: Options, is_picture: bo
     if options.roi is not None:
         detection, beside = _cut_region(frame, options.roi, detection)
     # estimate
-    spots = _estimate(detection, chosen, beside, options)
-    return Specularities([replace(spot, id=i) for i, spot in enumerate(spots)], detection, choices)
+    spots, no_cloud = _estimate(detection, chosen, beside, options)
+    numbered = [replace(spot, id=i) for i, spot in enumerate(spots)]
+    return Specularities(numbered, detection, choices, no_cloud=no_cloud)
 
 
 @dataclass(frozen=True)
@@ -225,11 +226,11 @@ def _above_noise(patch: Patch | Failure) -> Patch | Failure:
 
 def _estimate(
     detection: Detection, estimators: Mapping[str, AnyEstimator], beside: Sequence[Region], options: Options
-) -> list[Specularity]:
-    """Run each estimator on all patches of a picture, or on the whole frame.
+) -> tuple[list[Specularity], Failure | None]:
+    """Run each estimator on all patches of a picture, or on the whole frame; and say why no cloud has an answer.
 
     `beside` are further specularities of the frame, which are only neighbours; answers outside the region that a user
-    named are not asked for.
+    named are not asked for. Where nobody asked for clouds, that they have no answer is no result of each highlight.
     """
     frame, regions = detection.frame, detection.regions
     highlights = detection.highlights or (None,) * len(regions)
@@ -253,6 +254,11 @@ def _estimate(
     priors = frame.calibration.priors
     relief = relief_part(priors)
     answers = {name: run_in_frame(each, frame, patches, priors) for name, each in estimators.items()}
+    no_cloud = None
+    if options.estimators is None and CLOUD in answers and not answers[CLOUD].elsewhere:
+        of_patches = zip(answers.pop(CLOUD).of_patches, patches, strict=True)
+        failures = [each for each, patch in of_patches if isinstance(each, Failure) and each is not patch]
+        no_cloud = failures[0] if failures else Failure(Reason.NO_ESTIMATE, "no highlight was found")
     spots = []
     for i, (region, patch, highlight) in enumerate(zip(regions, patches, highlights, strict=True)):
         given = {name: each.of_patches[i] for name, each in answers.items()}
@@ -274,7 +280,7 @@ def _estimate(
     spots.extend(sorted(undetected, key=lambda spot: any(each.cloud is not None for each in spot.normals.values())))
     if options.target == "base":
         spots = [replace(spot, estimates={**spot.estimates, **spot.organ}) for spot in spots]
-    return spots
+    return spots, no_cloud
 
 
 def _is_inside(point_px: Array, box: Box) -> bool:

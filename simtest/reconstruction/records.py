@@ -245,15 +245,17 @@ class Specularities(list[Specularity]):
         What its user should know.
     reference : optional
         How its normals compare with a reference (`simtest.validation.references`).
+    no_cloud : Failure, optional
+        Why no cloud tells the organ's normal, where `cloud` ran by default.
     """
 
     def __init__(
         self, spots: Iterable[Specularity], detection: Detection, choices: Choices, image: str = "",
-        warnings: Iterable[str] = (), reference: Any = None,
+        warnings: Iterable[str] = (), reference: Any = None, no_cloud: Failure | None = None,
     ) -> None:  # fmt: skip
         super().__init__(spots)
         self.detection, self.choices = detection, choices
-        self.image, self.warnings, self.reference = image, [*warnings], reference
+        self.image, self.warnings, self.reference, self.no_cloud = image, [*warnings], reference, no_cloud
 
     @property
     def camera(self) -> Camera:
@@ -264,6 +266,29 @@ class Specularities(list[Specularity]):
     def counted(self) -> str:
         """How many there are, in words."""
         return "1 specularity" if len(self) == 1 else f"{len(self)} specularities"
+
+    @property
+    def clouds(self) -> list[Specularity]:
+        """Those of its specularities that are clouds, each with the organ's normal."""
+        return [spot for spot in self if any(each.cloud is not None for each in spot.normals.values())]
+
+    @property
+    def of_organ(self) -> str:
+        """What tells the organ's normal, in a sentence; empty where nobody asked for clouds."""
+        if not (clouds := self.clouds):
+            return (
+                ""
+                if self.no_cloud is None
+                else f"no cloud of highlights tells the organ's normal: {self.no_cloud.detail}"
+            )
+        told = []
+        for spot in clouds:
+            estimate = next(each for each in spot.normals.values() if each.cloud is not None)
+            x, y = (round(float(v)) for v in estimate.look_px)
+            deviation = "" if estimate.deviation_deg is None else f" ± {estimate.deviation_deg:.2g} deg"
+            count = len(estimate.cloud.points_px) if estimate.cloud else 0
+            told.append(f"at ({x}, {y}) px{deviation}, from {count} highlights (no. {spot.id})")
+        return f"the organ's normal is told {'; '.join(told)}"
 
     @property
     def sightline_rule(self) -> tuple[str, ...]:
@@ -322,6 +347,7 @@ class Specularities(list[Specularity]):
             "frame": FRAME,
             "specularities": [spot.to_json(drawn) for spot in self],
             "clouds": [entry for spot in self for entry in spot.clouds_json(drawn)],
+            "no_cloud": None if self.no_cloud is None else self.no_cloud.detail,
             "other_highlights": others,
             "provenance": origin or provenance.environment(),
             **({} if self.reference is None else {"reference": self.reference}),

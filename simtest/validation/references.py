@@ -274,16 +274,18 @@ def _numbers(data: Mapping[str, Any], key: str, shapes: Sequence[tuple[int, ...]
 
 
 def compare(spots: Specularities, reference: Reference) -> None:
-    """Compare the normals of a picture with a reference at their brightest points.
+    """Compare the normals of a picture with a reference at their brightest points, those of clouds where they look.
 
-    Each specularity that has a peak gets the reference's normal and the errors of the estimators, deg: of the proposed
-    normal, and of the better candidate, as the article chooses by hand. Their means and standard deviations by
-    estimator become the picture's own ``reference``.
+    Each specularity that has a peak, or is a cloud, gets the reference's normal and the errors of the estimators, deg:
+    of the proposed normal, and of the better candidate, as the article chooses by hand. Their means and standard
+    deviations by estimator become the picture's own ``reference``.
     """
-    peaks = np.array([spot.peak_px for spot in spots if spot.peak_px is not None], dtype=float)
+    looks = [_compared_px(spot) for spot in spots]
+    peaks = np.array([look for look in looks if look is not None], dtype=float)
     normals = iter(reference.normals_at(peaks, spots.camera) if len(peaks) else ())
     spots[:] = [
-        spot if spot.peak_px is None else replace(spot, reference=_errors(spot, next(normals))) for spot in spots
+        spot if look is None else replace(spot, reference=_errors(spot, next(normals)))
+        for spot, look in zip(spots, looks, strict=True)
     ]
     # summarise the sightlines that meet the reference
     met = [spot.reference.errors for spot in spots if spot.reference is not None and spot.reference.normal is not None]
@@ -300,6 +302,12 @@ def compare(spots: Specularities, reference: Reference) -> None:
         sightline_rule=rule,
         of_sightline_rule=_summary(of_rule) if of_rule else None,
     )
+
+
+def _compared_px(spot: Specularity) -> Array | None:
+    """Return the peak of a highlight, or where the estimate of a cloud looks; None where there is neither."""
+    own = (each.look_px for each in spot.normals.values() if each.cloud is not None)
+    return next(own, None) if spot.peak_px is None else spot.peak_px
 
 
 def _errors(spot: Specularity, normal: Array) -> ReferenceRecord:

@@ -397,7 +397,8 @@ def cloud_rows(
     """Make the rows of cloud estimators: of each estimate, and of each whole cloud that none is of.
 
     `found` and `failures` are those of `apart`, `whole` the columns of the clouds that are wholly in view. The column
-    ``true_id`` is the index of the base's highlight point, as ``cloud``; errors are against the base's normal there.
+    ``true_id`` is the index of the base's highlight point, as ``cloud``; ``error_base_deg`` is against the base's
+    normal there, the other errors are where the estimate looks.
     """
     made, regions = [], CloudRegions.of(session, view.clouds) if any(found.values()) else None
     for name, estimates in found.items():
@@ -408,7 +409,7 @@ def cloud_rows(
             taken.update(numbers)
             row = _cloud_row(session, common, view, whole, numbers[0] if numbers else None)
             row |= estimate_columns(estimate) | {"estimator": name, "specularity": i}
-            made.append(row | _cloud_errors(session, estimate, [view.clouds[n] for n in numbers]) if numbers else row)
+            made.append(row | _cloud_errors(session, estimate, [view.clouds[n] for n in numbers]))
         status = MISSED if name not in failures else str(failures[name].reason)
         detail = None if name not in failures else failures[name].detail
         for number, columns in whole.items():
@@ -428,15 +429,19 @@ def _cloud_row(session: Session, common: Row, view: RenderedView, whole: Mapping
 
 
 def _cloud_errors(session: Session, estimate: Estimate, centres: Sequence[HighlightPoint]) -> Row:
-    """Compute the errors against the base's normal at its highlight point, and where the estimate looks.
+    """Compute the errors against the base's normal where the estimate looks, and at its highlight point, if any.
 
-    Lights that are not told apart make one cloud: the truth is the mean of the normals at their points.
+    Lights that are not told apart make one cloud: its truth is the mean of the normals at their points.
     """
-    mean = np.mean([centre.normal_base for centre in centres], axis=0)
-    truth = mean / np.linalg.norm(mean)
+    mean = np.sum([centre.normal_base for centre in centres], axis=0) if centres else None
+    point = None if mean is None else np.asarray(mean / np.linalg.norm(mean))
     look = session.exact_points(estimate.look_px[None], fine=False)
-    errors = scored(estimate, truth, look.normal_base[0] if look.valid[0] else None)
+    truth = look.normal_base[0] if look.valid[0] else point
+    if truth is None:
+        return {}
     truth_x, truth_y, truth_z = truth.tolist()
-    return errors | {
-        "error_base_deg": errors["error_deg"], "truth_x": truth_x, "truth_y": truth_y, "truth_z": truth_z,
+    return {
+        **scored(estimate, truth, truth if look.valid[0] else None),
+        "error_base_deg": None if point is None else float(angle_deg(estimate.normal, point)),
+        "truth_x": truth_x, "truth_y": truth_y, "truth_z": truth_z,
     }  # fmt: skip

@@ -17,9 +17,9 @@ from scipy.optimize import minimize
 from simtest.calibration import Frame
 from simtest.errors import Failure
 from simtest.estimators.budget import total
-from simtest.estimators.cloud import SLOPES, TYPICAL_SLOPE, cloud, density_of
+from simtest.estimators.cloud import LEAST_VERIFIABLE, SLOPES, TYPICAL_SLOPE, Groups, cloud
 from simtest.estimators.cloud_light import DiffuseLight, find_spots
-from simtest.estimators.cloud_mixture import CLUMPING, fit_mixture, sampling_covariance, window_of
+from simtest.estimators.cloud_mixture import CLUMPING, sampling_covariance
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Array
 from studies.clouds.organ_frames import ORGANS, SLOPES_DEG, BaseFrame, frames
@@ -31,9 +31,6 @@ REGION = 3.0
 
 SURE, SURE_DEG = 3.0, 5.0
 """Wrong and sure: so many times the stated error, and by so much."""
-
-LEAST_SPOTS = 3
-"""Clouds of fewer are not fitted to."""
 
 
 @dataclass(frozen=True)
@@ -95,33 +92,29 @@ def found_in(frame: BaseFrame) -> list[Found]:
     calibration = frame.calibration
     given, camera = Frame(frame.picture, calibration, SMOOTHING_PX), calibration.camera
     spots, light, rows = find_spots(given), DiffuseLight(given), []
-    if len(spots.peaks) < LEAST_SPOTS or not light.shows:
+    if len(spots.peaks) < cloud.least_spots or not light.shows:
         return []
-    lights, twice = calibration.priors.lights, 2 * calibration.priors.distance.mean
-    window = window_of(camera, given.seen)
-    mixture = fit_mixture(
-        camera.unproject(spots.points_px), window, lambda centre: lights @ basis_across(centre).T / twice
-    )
-    owner, densest = mixture.belongs.argmax(axis=1), max(map(density_of, mixture.clouds))
-    for i, each in enumerate(mixture.clouds):
-        count, truth = int(np.count_nonzero(owner == i)), frame.normal_at(camera.project(each.sightline))
+    groups = Groups.of(given, spots, camera, calibration.priors)
+    for each, own in zip(groups.clouds, groups.spots, strict=True):
+        count, truth = len(own.peaks), frame.normal_at(camera.project(each.sightline))
         shading = light.around(each.sightline, each.covariance)
-        if count < LEAST_SPOTS or truth is None or shading is None:
+        is_judged = count >= cloud.least_spots and each.seen >= LEAST_VERIFIABLE
+        if not is_judged or truth is None or shading is None:
             continue
         half = basis_across(each.centre)
         across = half @ basis_across(each.sightline).T
         gains = across @ shading.gains @ across.T
         back = np.linalg.inv(2 * np.eye(2) + gains) @ across
-        slope = math.sqrt(float(np.trace(gains @ each.covariance @ gains.T)) / 2)
+        slope = math.sqrt(float(np.trace(each.covariance)) / 2)
         square = TYPICAL_SLOPE * float(np.clip(slope, *SLOPES))
-        sampling = sampling_covariance(each, window, max(count / CLUMPING, 2.5))
+        sampling = sampling_covariance(each, groups.window, max(count / CLUMPING, 2.5))
         rows.append(
             Found(
                 half @ (truth + each.centre),
                 each.turns.mean(axis=0) - back @ shading.gradient,
                 back @ shading.covariance @ back.T,
                 square * float(np.trace(np.linalg.solve(each.covariance, sampling))) / 2,
-                square * 2 * math.log(max(densest / density_of(each), 1.0)),
+                square * groups.dimness(each),
             )
         )
     return rows
@@ -134,17 +127,19 @@ def fitted(rows: Sequence[Found]) -> dict[str, float]:
     chance, dimness = (np.array([getattr(row, name) for row in rows]) for name in ("chance", "dimness"))
 
     def cost(logs: Array) -> float:
-        aside, dimmer, own, factor, share = np.exp(logs)
-        spots = aside**2 + chance + dimmer**2 * dimness
+        aside, number, dimmer, own, factor, share = np.exp(logs)
+        spots = aside**2 + number**2 * chance + dimmer**2 * dimness
         other = own**2 + factor**2 * jackknife + share**2 * (light**2).sum(axis=1)
         variance = spots * other / (spots + other)
         gap = truth - (spots / (spots + other))[:, None] * light
         return float(np.mean(np.log(variance) + (gap**2).sum(axis=1) / (2 * variance)))
 
-    start = np.log([math.radians(5.0), 1.0, math.radians(2.0), 1.0, 0.5])
-    aside, dimmer, own, factor, share = np.exp(minimize(cost, start, method="Nelder-Mead", options={"maxiter": 9999}).x)
+    start = np.log([math.radians(5.0), 1.0, 1.0, math.radians(2.0), 1.0, 0.5])
+    aside, number, dimmer, own, factor, share = np.exp(
+        minimize(cost, start, method="Nelder-Mead", options={"maxiter": 9999}).x
+    )
     degrees = {"aside": math.degrees(aside), "light": math.degrees(own)}
-    return {**degrees, "dimmer": dimmer, "jackknife": factor, "own_share": share}
+    return {**degrees, "chance": number, "dimmer": dimmer, "jackknife": factor, "own_share": share}
 
 
 def main() -> None:

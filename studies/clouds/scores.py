@@ -24,7 +24,7 @@ MANY = 15
 CLOSE = 0.15
 """A slope this near, as a share of the true one, counts as right."""
 
-WARNINGS = {"base_doubted", "base_unverified", "cut", "wide"}
+WARNINGS = {"base_unverified", "cut", "wide"}
 """Flags with which a false answer is no sure one."""
 
 REGION = chi_squared.quantile(0.95, 2)

@@ -16,6 +16,7 @@ NORMALS = {
     "specularities": "a list, the brightest first: the next table",
     "clouds": "clouds of highlights that estimates rest on: specularity, estimator, highlights, points_px, covariance, "
     "axis_ratio, seen, slope_deg (value, low, high), outline",
+    "no_cloud": "why no cloud tells the organ's normal, where `cloud` ran by default; else null",
     "other_highlights": "highlights of other kinds, by colour alone: box_px, peak_px, and "
     "the keys from kind to outline of the next table",
     "provenance": "versions and machine",

@@ -144,7 +144,7 @@ def test_the_calibration_states_what_is_not_inferred():
         "highlights",
     ]
     # An array gets the same default estimators as a file: lights and a distance are enough for one more.
-    assert choices.estimators[-1] == "bisector"
+    assert choices.estimators[-2:] == ("bisector", "cloud")
 
 
 def test_the_choices_say_what_was_inferred():
@@ -152,7 +152,7 @@ def test_the_choices_say_what_was_inferred():
     assert choices.inferred == ("encoding", "saturation_level", "detector", "smoothing_px", "estimators")
     assert str(choices) == (
         "encoding srgb (inferred), clipped at 1 (inferred), detector colour (inferred), smoothing 1 px (inferred), "
-        f"estimators {' '.join(DEFAULT_ESTIMATORS)} (inferred)"
+        f"estimators {' '.join(DEFAULT_ESTIMATORS)} cloud (inferred)"
     )
 
 

@@ -707,7 +707,7 @@ def test_a_command_prints_the_record_that_it_returns(capsys):
 class Spots(list):
     """Specularities without an estimate or a reference: two of three isolated, the others clusters."""
 
-    reference, sightline_rule = None, ()
+    reference, sightline_rule, clouds = None, (), ()
 
     def __init__(self, count):
         super().__init__(

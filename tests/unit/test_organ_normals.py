@@ -113,3 +113,59 @@ def test_with_a_light_beside_the_camera_each_estimator_has_its_row():
     spots, rule, rows = rule_and_rows(Priors(lights_mm=((4.0, 0.0, 0.0),), distance_mm=exactly(30.0)))
     assert (rule, spots.rule_note) == ((), "")
     assert set(rows) == {"brightest_point", "cone_axis", "curved"}
+
+
+def glitter(count=60):
+    """A picture of tissue that faces the camera at one pixel, with spots about it, or about nothing, 8 bits."""
+    camera = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
+    y, x = np.mgrid[:240, :320] + 0.5
+    rng, points = np.random.default_rng(3), []
+    while len(points) < count:
+        point = rng.normal((150.0, 110.0), 16.0)
+        if all(np.hypot(*(point - other)) > 5.0 for other in points):
+            points.append(point)
+    ground = 0.35 * np.exp(-((x - 150) ** 2 + (y - 110) ** 2) / (2 * 110.0**2))
+    spots = sum(np.exp(-((x - u) ** 2 + (y - v) ** 2) / 4.5) for u, v in points)
+    light = ground[..., None] * np.array([1.0, 0.5, 0.4]) + np.asarray(spots)[..., None]
+    light += 0.003 * rng.standard_normal(light.shape)
+    return np.rint(255 * np.clip(light, 0, 1) ** (1 / 2.2)).astype(np.uint8), camera
+
+
+def test_a_picture_tells_the_organs_normal_without_being_asked(tmp_path):
+    picture, camera = glitter()
+    spots = reconstruct(picture, camera)
+    (cloud,) = spots.clouds
+    estimate = cloud.normals["cloud"]
+    assert estimate.target == "base"
+    x, y = np.round(estimate.look_px).astype(int)
+    count = len(estimate.cloud.points_px)
+    told = f"at ({x}, {y}) px ± {estimate.deviation_deg:.2g} deg, from {count} highlights (no. {cloud.id})"
+    assert spots.of_organ == f"the organ's normal is told {told}"
+    assert spots.to_json()["no_cloud"] is None
+    assert all("cloud" not in spot.estimates for spot in spots if spot is not cloud)
+
+    class Facing:
+        source, notes = "facing", ()
+
+        def normals_at(self, pixels, camera):
+            assert any(np.allclose(pixel, estimate.look_px) for pixel in pixels)
+            return -camera.unproject(pixels)
+
+    compare(spots, Facing())
+    assert spots.reference.estimators["cloud"].inside == 1.0
+    assert spots.reference.estimators["cloud"].mean_deg < 10.0
+
+
+def test_where_no_cloud_tells_it_one_line_says_why():
+    """And no highlight has a failure that nobody asked for."""
+    picture, camera = glitter(4)
+    spots = reconstruct(picture, camera)
+    assert spots.clouds == []
+    assert spots.of_organ == f"no cloud of highlights tells the organ's normal: {spots.no_cloud.detail}"
+    assert spots.to_json()["no_cloud"] == spots.no_cloud.detail
+    assert "a cloud takes 6" in spots.of_organ
+    assert all("cloud" not in spot.estimates for spot in spots)
+    # Who asks for it gets its failure at each highlight, and a part of a picture is not asked for it.
+    assert not reconstruct(picture, camera, estimators=["cone_axis", "cloud"])[0].normals.get("cloud")
+    assert reconstruct(picture, camera, estimators=["cone_axis"]).of_organ == ""
+    assert reconstruct(picture, camera, roi=(100, 60, 100, 100)).of_organ == ""

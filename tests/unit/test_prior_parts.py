@@ -12,6 +12,7 @@ from simtest.estimators.budget import equivalent_variance, line_covariance
 from simtest.estimators.family import fit_isophote_family
 from simtest.estimators.names import load_estimators
 from simtest.estimators.prior_parts import (
+    FADES,
     SPOT_ONSET,
     SPOT_SPREAD,
     STEEPER,
@@ -216,19 +217,23 @@ def test_an_error_along_a_line_is_covered_beside_a_normal_one(draw):
     np.testing.assert_allclose(turned, v * np.outer([0.6, 0.8], [0.6, 0.8]), atol=1e-9 * v)
 
 
-@pytest.mark.parametrize(("plane", "steeper"), [(True, 1.0), (False, STEEPER)])
-def test_relief_is_covered_at_the_base(plane, steeper):
+@pytest.mark.parametrize("plane", [True, False])
+def test_relief_is_covered_at_the_base(plane):
     rng, count = np.random.default_rng(6), 40000
     slope = np.radians(rng.uniform(3, 20, count))
-    # highlights lie wider than the slope by the width of their lobe, in squares, and on organs where it is steep
+    # highlights lie wider than the slope by the width of their lobe, in squares, and on organs where it is steep, as
+    # far as steep facets are in view
+    steeper = 1.0 if plane else STEEPER / np.hypot(1, slope / FADES)
     spread = np.hypot(steeper * slope, SPOT_SPREAD * np.sqrt(1 - np.exp(-((slope / SPOT_ONSET) ** 2))))
     moves = spread[:, None] * rng.standard_normal((count, 2))
     assert held(moves, relief_part(Priors(plane=plane))) == pytest.approx(0.95, abs=0.006)
+    told = relief_part(Priors(relief_slope=exactly(np.radians(5.0)), plane=plane))
+    steeper = 1.0 if plane else STEEPER / np.hypot(1, np.radians(5.0) / FADES)
+    np.testing.assert_allclose(told, ((steeper * np.radians(5.0)) ** 2 + SPOT_SPREAD**2) * np.eye(2), rtol=1e-5)
     if not plane:
         # Negative control: what holds a plane's relief does not hold an organ's.
-        assert held(moves, relief_part(Priors(plane=True))) < 0.9
-    told = relief_part(Priors(relief_slope=exactly(np.radians(5.0)), plane=plane))
-    np.testing.assert_allclose(told, ((steeper * np.radians(5.0)) ** 2 + SPOT_SPREAD**2) * np.eye(2), rtol=1e-5)
+        moves = np.sqrt(told[0, 0]) * rng.standard_normal((count, 2))
+        assert held(moves, relief_part(Priors(relief_slope=exactly(np.radians(5.0)), plane=True))) < 0.9
     # A smooth surface has one highlight, at the base's own brightest point.
     np.testing.assert_array_equal(relief_part(Priors(relief_slope=exactly(0.0), plane=plane)), np.zeros((2, 2)))
 

@@ -12,6 +12,7 @@ from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.estimators.cloud import CloudCentre, cloud
 from simtest.estimators.cone_axis import cone_axis
+from simtest.estimators.protocol import Estimate
 from simtest.geometry.vectors import angle_deg
 from simtest.pages.style import degrees
 from simtest.rendering import Session
@@ -28,7 +29,7 @@ from simtest.validation.columns import SCHEMA, table
 from simtest.validation.glints import whole_clouds
 from simtest.validation.predicted import base_law_deg, centroid_law_deg, glint_count_law
 from simtest.validation.realisation import Realiser, keep_frame
-from simtest.validation.scoring import match_cloud, rows
+from simtest.validation.scoring import _cloud_errors, match_cloud, rows
 from simtest.validation.statistics import summarise
 
 SMALL = {"camera.width": 96, "camera.height": 96, "camera.fx": 120.0, "camera.fy": 120.0, "sensor.noise_sigma": 0.0}
@@ -297,6 +298,11 @@ def test_the_laws_hold_for_isotropic_gaussian_relief_under_a_light_at_the_camera
     assert law(one, reflectance=film) == (None, None)
 
 
+def direction(tilt_deg):
+    tilt = np.radians(tilt_deg)
+    return np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
+
+
 PLANE = {
     "surface.tilt_deg": 25.0, "surface.distance_mm": 25.0, "reflectance.exponent": 400.0, "camera.width": 512,
     "camera.height": 512, "camera.fx": 300.0, "camera.fy": 300.0, "sensor.noise_sigma": 0.01,
@@ -322,7 +328,8 @@ def test_a_cloud_is_measured_against_the_base():
     assert row["cloud"] == row["true_id"] == made.view.clouds.index(centre)
     # The normal of a plane 25 deg off the optical axis.
     normal = np.array([row["normal_x"], row["normal_y"], row["normal_z"]])
-    assert row["error_deg"] == row["error_base_deg"] == pytest.approx(float(angle_deg(normal, centre.normal_base)))
+    assert row["error_base_deg"] == pytest.approx(float(angle_deg(normal, centre.normal_base)), abs=1e-6)
+    assert row["error_deg"] == pytest.approx(row["error_base_deg"], abs=1e-6)
     assert row["error_deg"] < 3.0
     assert row["error_look_deg"] == pytest.approx(row["error_deg"], abs=1e-6)
     assert row.get("error_fine_deg") is None
@@ -331,6 +338,26 @@ def test_a_cloud_is_measured_against_the_base():
     # Where no estimate is of it, the vote is empty.
     estimate = made.specularities[-1].estimates["cloud"]
     assert match_cloud(CloudRegions.of(session, made.view.clouds), made.view, estimate) == [row["cloud"]]
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_the_error_of_a_cloud_is_that_where_it_looks(seen):
+    """Its highlight point may lie elsewhere on a curved base, or nowhere; off the surface it is all there is."""
+    at_look, at_point = direction(30.0), direction(20.0)
+    session = SimpleNamespace(
+        exact_points=lambda pixels, fine: SimpleNamespace(normal_base=at_look[None], valid=np.array([seen]))
+    )
+    estimate = Estimate(
+        normal=direction(33.0), candidates=direction(33.0)[None], look_px=np.zeros(2), axis_ratio=1.0, target="base"
+    )
+    found = _cloud_errors(session, estimate, [SimpleNamespace(normal_base=at_point)])
+    assert found["error_deg"] == pytest.approx(3.0 if seen else 13.0)
+    assert found["error_base_deg"] == pytest.approx(13.0)
+    assert found["error_look_deg"] == (pytest.approx(3.0) if seen else None)
+    assert [found[f"truth_{axis}"] for axis in "xyz"] == (at_look if seen else at_point).tolist()
+    alone = _cloud_errors(session, estimate, [])
+    assert alone.get("error_base_deg") is None
+    assert alone.get("error_deg") == (pytest.approx(3.0) if seen else None)
 
 
 @pytest.mark.render
