@@ -108,7 +108,8 @@ def _sequence(source: Path, out: Path, options: "Options") -> Told:
 
 def _record_parts(spots: "Specularities", image: Path) -> "Iterator[str | Table]":
     """Yield the best normals, what they state, what is assumed, and how many highlights have one."""
-    if spots.of_organ:
+    # What tells the organ's normal leads; that nothing does is one of the remarks.
+    if spots.clouds:
         yield spots.of_organ
     yield from record_tables(spots)
     if spots.stated is not None:
@@ -117,6 +118,8 @@ def _record_parts(spots: "Specularities", image: Path) -> "Iterator[str | Table]
             yield f"of the organ below its relief: {organ}"
         yield MEANING
     yield from silent_lines(spots)
+    if spots.of_organ and not spots.clouds:
+        yield f"note: {spots.of_organ}"
     if note := spots.rule_note:
         yield f"note: {note}"
     yield from assumed_lines(spots.choices.assumed)
