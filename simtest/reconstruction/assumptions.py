@@ -70,6 +70,18 @@ NEAR_MISSES = Assumption(
 """Shares and errors: python -m studies.human_meshes (docs/concepts/uncertainty.md)."""
 
 
+USUAL_FOV = (10.0, 170.0)
+"""Of an endoscope, deg."""
+
+
+def fov_question(fov_deg: float) -> list[str]:
+    """Return a question about a field of view, deg, that no endoscope has; empty for a usual one."""
+    low, high = USUAL_FOV
+    if low <= fov_deg <= high:
+        return []
+    return [f"field of view of {fov_deg:g} deg: is it in degrees? Endoscopes see {low:g} to {high:g} deg"]
+
+
 def calibration_of_view(fov_deg: float, width: int, height: int, across: Extent = "width") -> Calibration:
     """Return the calibration of a camera of which the field of view alone is known, deg, across the whole picture.
 

@@ -26,6 +26,7 @@ from simtest.reconstruction.assumptions import (
     assumptions,
     calibration_of_round_view,
     calibration_of_view,
+    fov_question,
 )
 from simtest.reconstruction.images import check_roi, is_coloured
 from simtest.runtime.arrays import Image, short_repr
@@ -157,7 +158,7 @@ def calibration_for(options: Options, picture: Image) -> tuple[Calibration, list
     else:
         raise InputError("--fov-of view: no round view was found in the picture; give width, height or diagonal")
     angle = f"the field of view of {options.fov_deg:g} deg across the picture's {extent}"
-    return calibration, [f"no calibration: all angles depend on {angle} being right"]
+    return calibration, [f"no calibration: all angles depend on {angle} being right", *fov_question(options.fov_deg)]
 
 
 @dataclass(frozen=True)

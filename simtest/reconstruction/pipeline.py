@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -22,8 +23,8 @@ from simtest.estimators.protocol import Target
 from simtest.estimators.small_spots import UNRESOLVED
 from simtest.geometry import Camera, Patch
 from simtest.geometry.patch import share_of_noise
-from simtest.reconstruction.assumptions import border_note, calibration_of_view
-from simtest.reconstruction.images import check_frame, check_size, image_size
+from simtest.reconstruction.assumptions import border_note, calibration_of_view, fov_question
+from simtest.reconstruction.images import check_frame, check_size, image_size, read_picture
 from simtest.reconstruction.options import CLOUD, SMOOTHING_BY_COLOUR_PX, Options, check_encoding, choose
 from simtest.reconstruction.records import Specularities, Specularity
 from simtest.runtime.arrays import Array, Image
@@ -45,7 +46,7 @@ REFUSED = "the detector does not answer for this picture"
 
 @plain_errors
 def reconstruct(
-    frame: npt.ArrayLike,
+    frame: npt.ArrayLike | Path,
     camera: Camera | Calibration | float,
     estimators: Sequence[str] | Mapping[str, AnyEstimator] | None = None,
     roi: tuple[int, int, int, int] | None = None,
@@ -66,9 +67,9 @@ def reconstruct(
 
     Parameters
     ----------
-    frame : array_like, shape (H, W) or (H, W, C)
-        Channels are RGB (OpenCV reads BGR: reverse them); of a picture, alpha is left out; of real numbers there may be
-        any number of channels.
+    frame : array_like, shape (H, W) or (H, W, C), or path
+        A path, or a text, names a picture's file. Channels are RGB (OpenCV reads BGR: reverse them); of a picture,
+        alpha is left out; of real numbers there may be any number of channels.
     camera : Camera, Calibration or float
         Of the same size. What a calibration knows is undone before smoothing: the response, then vignetting and
         emission. A camera alone is taken as exact. A number is the horizontal field of view, deg, where nothing else is
@@ -115,8 +116,12 @@ def reconstruct(
     >>> len(found), found.choices.detector
     (1, 'peaks')
     """
+    name, cautions = "", list[str]()
+    if isinstance(frame, str | Path):
+        name, frame = str(frame), read_picture(Path(frame))
     if isinstance(camera, int | float) and not isinstance(camera, bool):
         height, width = image_size(frame)
+        cautions = fov_question(camera)
         camera = calibration_of_view(camera, width, height)
     elif isinstance(camera, Camera):
         camera = Calibration(camera)
@@ -125,12 +130,18 @@ def reconstruct(
     check_encoding(encoding, camera)
     if not isinstance(isolated, bool | np.bool_):
         raise InputError(f"isolated is a {type(isolated).__name__}: must be True or False")
-    image, is_picture = check_frame(frame, camera.camera, encoding)
+    if name:
+        image, is_picture = np.asarray(frame), True
+        check_size(image, camera.camera)
+    else:
+        image, is_picture = check_frame(frame, camera.camera, encoding)
     options = Options(
         estimators=estimators, roi=roi, encoding=encoding, every=not isolated, detector=detector,
         smoothing_px=smoothing_px, target=target,
     )  # fmt: skip
-    return run(image, camera, options, is_picture)
+    spots = run(image, camera, options, is_picture)
+    spots.image, spots.warnings = name, cautions
+    return spots
 
 
 def reconstruct_values(

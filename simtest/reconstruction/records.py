@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -27,6 +27,9 @@ from simtest.runtime import provenance
 from simtest.runtime.arrays import LONGEST, Array, clipped, short_repr, vector
 from simtest.runtime.files import JsonObject
 from simtest.spec import describe_camera
+
+if TYPE_CHECKING:
+    import polars as pl
 
 Points = list[list[float]]
 
@@ -352,6 +355,15 @@ class Specularities(list[Specularity]):
             "provenance": origin or provenance.environment(),
             **({} if self.reference is None else {"reference": self.reference}),
         }
+
+    def to_polars(self) -> "pl.DataFrame":
+        """Return the table of normals.csv: a row for each specularity, estimator and candidate, 0 the proposed one."""
+        import polars as pl
+
+        from simtest.reconstruction.outputs import COLUMNS, normals_rows
+
+        entries = [spot.to_json(drawn=False) for spot in self]
+        return pl.DataFrame([*normals_rows(entries)], schema=list(COLUMNS), orient="row", infer_schema_length=None)
 
     def __repr__(self) -> str:
         answered = sum(bool(each.normals) for each in self)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,10 +15,11 @@ from test_colour_detection import HEIGHT, WIDTH, lobe, picture
 import simtest
 from simtest.calibration import Calibration, Frame, NoiseModel, Priors, Response, exactly, srgb_encode
 from simtest.detection.colour import ColourDetector
-from simtest.errors import Failure
+from simtest.errors import Failure, InputError
 from simtest.geometry import Camera
 from simtest.reconstruction.images import read_picture
 from simtest.reconstruction.options import DEFAULT_ESTIMATORS, Options, calibration_for, complete
+from simtest.reconstruction.outputs import write_outputs
 from simtest.reconstruction.pipeline import reconstruct, reconstruct_values
 
 CAMERA = Camera.from_fov(60.0, WIDTH, HEIGHT)
@@ -257,3 +259,39 @@ def test_light_by_colour_is_that_of_a_stated_linear_response():
 def test_the_noise_of_a_picture_has_the_steps_of_its_encoding(encoding):
     known = complete(Calibration(SMALL, noise=NoiseModel(bits=8)), encoding)
     assert known.noise.response == known.response == Response(encoding or "srgb")
+
+
+def test_a_path_is_read_as_the_command_reads_it(tmp_path):
+    """Text and path alike; the frame of the same pixels gives the same normals."""
+    file = tmp_path / "shot.png"
+    cv2.imwrite(str(file), tissue()[:, :, ::-1])
+    by_array = reconstruct(tissue(), CAMERA)
+    for named in (file, str(file)):
+        by_path = reconstruct(named, CAMERA)
+        assert by_path.image == str(file)
+        assert str(by_path.choices) == str(by_array.choices)
+        assert by_path.to_polars().equals(by_array.to_polars())
+    with pytest.raises(InputError, match=r"none\.png: no such file"):
+        reconstruct(tmp_path / "none.png", CAMERA)
+    with pytest.raises(InputError, match="camera"):
+        reconstruct(file, Camera.from_fov(60.0, 64, 48))
+
+
+def test_the_table_of_a_result_is_that_of_its_file(tmp_path):
+    spots = reconstruct(tissue(), CAMERA)
+    table = spots.to_polars()
+    write_outputs(tmp_path, spots, tissue() / 255)
+    read = pl.read_csv(tmp_path / "normals.csv", infer_schema_length=None)
+    assert table.columns == read.columns
+    assert table.height == read.height > 0
+    for column in ("specularity", "best", "estimator", "status"):
+        assert table[column].to_list() == read[column].to_list()
+    np.testing.assert_allclose(table["normal_z"].drop_nulls(), read["normal_z"].drop_nulls(), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("fov_deg", "asked"), [(1.7, True), (9.9, True), (10.0, False), (170.0, False), (171.0, True)])
+def test_a_field_of_view_that_no_endoscope_has_is_asked_about(fov_deg, asked):
+    """1.7 may be meant in radians."""
+    question = f"field of view of {fov_deg:g} deg: is it in degrees? Endoscopes see 10 to 170 deg"
+    assert (question in reconstruct(tissue(), fov_deg).warnings) == asked
+    assert (question in calibration_for(Options(fov_deg=fov_deg), tissue() / 255)[1]) == asked
