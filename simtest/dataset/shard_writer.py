@@ -114,7 +114,7 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
         nonlocal done
         done += 1
         if progress:
-            progress(min(done, total), total + 1, f"{manifest.dataset['name']}: samples")
+            progress(min(done, total), total, f"{manifest.dataset['name']}: samples")
 
     # shards
     if tasks:
@@ -124,8 +124,6 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
     _write_shards(plan, manifest, folder, engine.run(write_shard, tasks, step), missing)
     # tables and card, of all shards
     if not manifest.tables or not all((folder / name).exists() for name in manifest.tables):
-        if progress:
-            progress(total, total + 1, "tables")
         write_tables(plan, folder)
         write_card(plan, manifest, folder)
         manifest.tables = {name: file_entry(folder / name) for name in (*TABLES, CARD)}

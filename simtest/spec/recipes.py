@@ -357,11 +357,16 @@ class Distribution(Spec):
 
 
 class Splits(Spec):
-    """Shares of the samples; no anatomy is in two of them."""
+    """Shares of the samples; no anatomy is in two of them. Where some are named the others are 0."""
 
     train: Share = 0.8
     validation: Share = 0.1
     test: Share = 0.1
+
+    @model_validator(mode="before")
+    @classmethod
+    def _unnamed(cls, given: object) -> object:
+        return {**dict.fromkeys(cls.model_fields, 0.0), **given} if isinstance(given, dict) and given else given
 
     @model_validator(mode="after")
     def _whole(self) -> "Splits":

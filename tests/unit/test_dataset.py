@@ -178,7 +178,7 @@ BAD = {
     "outside": ("per_sample", {"sensor.noise_sigma": {"low": 0.0, "high": 2.0}}, "sensor.noise_sigma = 2.0"),
     "no such key": ("per_sample", {"sensor.noise": {"low": 0.0, "high": 0.1}}, "sensor.noise = 0.0: unknown key"),
     "log of 0": ("per_sample", {"sensor.noise_sigma": {"low": 0, "high": 0.1, "log": True}}, "must be above 0"),
-    "splits": ("splits", {"train": 0.5, "test": 0.1}, r"train \+ validation \+ test = 0.7: must be 1"),
+    "splits": ("splits", {"train": 0.5, "test": 0.1}, r"train \+ validation \+ test = 0.6: must be 1"),
     "few anatomies": ("families", [{"scene": "plane"}], "1 anatomies for 3 splits"),
     "estimator": ("estimators", ["cone"], "cone"),
     "weights": ("per_sample", {"sensor.seed": {"choose": [1, 2], "weights": [1]}}, "must be as many"),
@@ -341,7 +341,11 @@ def test_truth_is_where_the_highlight_is(made):
 
 
 def test_same_bytes_again_whole_and_alone(made, tmp_path):
-    write_dataset(tiny(**SIX), tmp_path / "again", make_engine())
+    steps: list[tuple[int, int, str]] = []
+    write_dataset(tiny(**SIX), tmp_path / "again", make_engine(), progress=lambda *step: steps.append(step))
+    # Progress counts samples, and nothing else.
+    assert {total for _, total, _ in steps} == {6}
+    assert steps[-1][0] == 6
     assert contents(tmp_path / "again") == contents(made)
     reproduce_sample(made, 4, tmp_path / "alone")
     assert compare(made, 4, tmp_path / "alone").endswith("same bytes")
@@ -928,3 +932,21 @@ def test_the_order_of_keys_in_a_file_does_not_matter():
 def test_a_process_is_replaced_after_its_tasks():
     pids = [pid for _, pid in make_engine(workers=2, renew_after=1).run(process, range(6), lambda: None)]
     assert len(set(pids)) == 6
+
+
+@pytest.mark.parametrize(
+    ("given", "shares"),
+    [
+        ({}, {"train": 0.8, "validation": 0.1, "test": 0.1}),
+        ({"train": 1.0}, {"train": 1.0}),
+        ({"train": 0.75, "test": 0.25}, {"train": 0.75, "test": 0.25}),
+    ],
+)
+def test_splits_that_are_not_named_are_empty(given, shares):
+    """A dataset of one mesh is of one anatomy: `splits = { train = 1.0 }` is enough."""
+    assert validate(Splits, given, "splits").shares == shares
+
+
+def test_named_splits_must_be_whole():
+    with pytest.raises(InputError, match=r"train \+ validation \+ test = 0.5: must be 1"):
+        validate(Splits, {"train": 0.5}, "splits")
