@@ -121,9 +121,12 @@ class Specularity:
 
     @property
     def position_px(self) -> Array:
-        """The peak, or the middle of the region where there is none."""
+        """The peak; where there is none the pixel that a cloud's estimate looks at, or the middle of the region."""
+        if self.peak_px is not None:
+            return self.peak_px
         x, y, width, height = self.region.box
-        return np.array([x + width / 2, y + height / 2]) if self.peak_px is None else self.peak_px
+        looks = (each.look_px for each in self.normals.values() if each.cloud is not None)
+        return next(looks, np.array([x + width / 2, y + height / 2]))
 
     @property
     def kind(self) -> str | None:

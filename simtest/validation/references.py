@@ -280,7 +280,8 @@ def compare(spots: Specularities, reference: Reference) -> None:
     of the proposed normal, and of the better candidate, as the article chooses by hand. Their means and standard
     deviations by estimator become the picture's own ``reference``.
     """
-    looks = [_compared_px(spot) for spot in spots]
+    # Without a peak a cloud alone has a normal.
+    looks = [None if spot.peak_px is None and not spot.normals else spot.position_px for spot in spots]
     peaks = np.array([look for look in looks if look is not None], dtype=float)
     normals = iter(reference.normals_at(peaks, spots.camera) if len(peaks) else ())
     spots[:] = [
@@ -302,12 +303,6 @@ def compare(spots: Specularities, reference: Reference) -> None:
         sightline_rule=rule,
         of_sightline_rule=_summary(of_rule) if of_rule else None,
     )
-
-
-def _compared_px(spot: Specularity) -> Array | None:
-    """Return the peak of a highlight, or where the estimate of a cloud looks; None where there is neither."""
-    own = (each.look_px for each in spot.normals.values() if each.cloud is not None)
-    return next(own, None) if spot.peak_px is None else spot.peak_px
 
 
 def _errors(spot: Specularity, normal: Array) -> ReferenceRecord:

@@ -137,6 +137,7 @@ def test_a_picture_tells_the_organs_normal_without_being_asked(tmp_path):
     (cloud,) = spots.clouds
     estimate = cloud.normals["cloud"]
     assert estimate.target == "base"
+    np.testing.assert_array_equal(cloud.position_px, estimate.look_px)
     x, y = np.round(estimate.look_px).astype(int)
     count = len(estimate.cloud.points_px)
     told = f"at ({x}, {y}) px ± {estimate.deviation_deg:.2g} deg, from {count} highlights (no. {cloud.id})"
