@@ -21,7 +21,7 @@ help:
 	@echo "make docs      build/manual: the manual as a site; a warning or a dead link is an error"
 	@echo "make docs-commands  run the manual's commands as they stand; QUICK=--quick leaves out what takes minutes"
 	@echo "make docs-figures  make the manual's tables of measured figures anew and compare; CHEAP=--cheap leaves out what takes minutes"
-	@echo "make test      fast tests (7 to 10 minutes on 2 cores)"
+	@echo "make test      fast tests (4 to 10 minutes on 2 cores)"
 	@echo "make test-all  all tests, the slow ones too"
 	@echo "make test-extras  tests that need an extra, which it installs beside .venv, or another program"
 	@echo "make test-ci   what CI runs beyond make test: the cases marked ci, and those of test-extras"

@@ -1,5 +1,6 @@
 """Commands about frames for learning and about real ones: dataset, realism, fit, advise."""
 
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -196,11 +197,16 @@ def realism(
         Real colour frames: pictures, films, or folders of pictures. A film is one scene, and so is a folder whose name
         ends in .film; any other picture is a scene of its own.
     """
-    from simtest.realism.compare import compare
+    from simtest.realism.compare import LEAST_SCENES, compare
     from simtest.realism.frames import open_frames, open_generated
     from simtest.realism.page import write_comparison
 
     real, generated = open_frames(frames), open_generated(against, count, surfaces or ())
+    # Before the frames are measured, which takes long.
+    scenes = [len({frame.scene for frame in side}) for side in (real, generated)]
+    if min(scenes) < LEAST_SCENES:
+        told = f"{scenes[0]} real and {scenes[1]} generated scenes: a verdict needs {LEAST_SCENES} of each"
+        warnings.warn(told, stacklevel=2)
     stopped = "an earlier page stays; the same command begins anew"
     with exclusive_folder(out), progress_bar("compared", stopped) as progress:
         found = compare(real, generated, progress, seed or 0)

@@ -312,6 +312,21 @@ def test_a_bank_of_a_fit_keeps_neither_reliefs_nor_anatomies(tmp_path, monkeypat
     assert not (tmp_path / "kept").exists()
 
 
+def test_too_few_scenes_are_told_before_they_are_measured(tmp_path, monkeypatch):
+    for name, count in (("real", 3), ("made", 6)):
+        (tmp_path / name).mkdir()
+        for i in range(count):
+            picture(tmp_path / name / f"{i}.png", i)
+
+    def measured(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("simtest.realism.compare.compare", measured)
+    told = "3 real and 6 generated scenes: a verdict needs 5 of each"
+    with pytest.warns(UserWarning, match=told), pytest.raises(KeyboardInterrupt):
+        realism([tmp_path / "real"], against=str(tmp_path / "made"), out=tmp_path / "out")
+
+
 def test_the_command_says_too_few_scenes(tmp_path, capsys):
     for name, count in (("real", 3), ("made", 6)):
         (tmp_path / name).mkdir()
