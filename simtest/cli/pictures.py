@@ -60,7 +60,7 @@ def reconstruct(
     image: NamedPath,
     /,
     *,
-    out: Out,
+    out: Annotated[Path | None, path("Folder for the results; default reports/normals/IMAGE.")] = None,
     known: PictureOptions = DEFAULTS,
     roi: Annotated[str | None, about("Region of interest x,y,w,h in px; default: detected.")] = None,
     extras: Annotated[Extras, Parameter(name="*")] = NO_EXTRAS,
@@ -79,6 +79,7 @@ def reconstruct(
     from simtest.reconstruction.images import is_sequence
     from simtest.reconstruction.options import parse_roi
 
+    out = out or Path("reports/normals") / image.stem
     sequence = is_sequence(image)
     if sequence and any(vars(replace(extras, depth_scale=None)).values()):
         raise InputError(f"{image}: --reference, --camera-from-model and --depth are for single pictures")

@@ -33,7 +33,14 @@ from simtest.runtime.locks import exclusive_file, exclusive_folder
 
 
 @command
-def render(scene: SceneName, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> Told:
+def render(
+    scene: SceneName,
+    /,
+    *,
+    out: Annotated[Path | None, path("Folder for the results; default reports/frames/SCENE.")] = None,
+    settings: Settings = None,
+    variant: Variant = None,
+) -> Told:
     """Render a scene with its ground truth: frame.png, radiance.exr, truth.npz, frame.json, camera.toml.
 
     calibration.toml holds what reconstruction is told of frame.png: camera, response, falloff, noise, lights, distance
@@ -41,6 +48,7 @@ def render(scene: SceneName, /, *, out: Out, settings: Settings = None, variant:
     """
     from simtest import api
 
+    out = out or Path("reports/frames") / Path(scene).stem
     with exclusive_folder(out):
         with progress_bar("finding the truth", stopped="nothing is written") as move:
             frame = api.render(scene, values_of(settings), variant, move)

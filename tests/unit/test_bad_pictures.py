@@ -43,7 +43,7 @@ FRAMES = {
     "one number": (1.0, "frame has shape (): must be (H, W) or (H, W, C)"),
     "four dimensions": (SPOT[None, None], "frame has shape (1, 1, 24, 32): must be (H, W) or (H, W, C)"),
     "no channels": (np.empty((HEIGHT, WIDTH, 0)), "frame has shape (24, 32, 0)"),
-    "a file's name": ("frame.png", "frame holds values of type <U9: must be an array of real numbers"),
+    "a file that is not there": ("frame.png", "frame.png: no such file"),
     "numbers in quotes": ([["1", "2"], ["3", "4"]], "frame holds values of type <U1"),
     "ragged": ([[1, 2], [3]], "frame: must be an array of numbers; its rows differ in length"),
     "complex": (SPOT * 1j, "frame holds values of type complex128: must be an array of real numbers"),

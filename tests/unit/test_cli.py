@@ -13,6 +13,7 @@ import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import polars as pl
 import pytest
@@ -22,9 +23,10 @@ import simtest.report
 from simtest import api
 from simtest.cli import commands, common, progress
 from simtest.cli import main as front
-from simtest.cli.common import gather_settings
+from simtest.cli.common import PictureOptions, gather_settings
+from simtest.cli.pictures import reconstruct
 from simtest.cli.runs import validate
-from simtest.cli.scenes import HEADINGS, names_of
+from simtest.cli.scenes import HEADINGS, names_of, render
 from simtest.dataset import verify as verifying
 from simtest.errors import InputError
 from simtest.estimators.names import DESCRIPTIONS, ESTIMATORS, describe_estimators, load_estimators
@@ -113,8 +115,9 @@ def test_help_and_pages_name_all_that_is_shipped(here, command, kind, page):
 BAD_USE = {
     "frobnicate": 'Unknown command "frobnicate". Available commands: ',
     "render": "SCENE: missing (A scene file, a sample's JSON, or a shipped scene); simtest render --help describes it",
-    "render plane": "--out: missing (Folder for the results; made if need be); simtest render --help describes it",
+    "views colon": "--out: missing (Folder for the results; made if need be); simtest views --help describes it",
     "render plane --out": "--out: needs a value (Folder for the results",
+    "reconstruct none.png --fov 60": "none.png: no such file",
     "score answers.csv": "--on: missing (Run or dataset whose frames were exported",
     "core check": "COMMAND: missing; simtest core check --help describes it",
     "core check .": "estimator 'command: .': . is a folder; must be a program",
@@ -745,3 +748,19 @@ def test_a_night_prints_its_verdict_as_json(here, monkeypatch, tmp_path):
     code, output, errors = here("nightly", "--json")
     assert (code, errors) == (1, [])
     assert json.loads(output) == {**verdict, "files": [str(tmp_path / "index.html")]}
+
+
+def test_pictures_and_frames_have_a_folder_of_their_own_where_none_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shot = np.full((60, 80, 3), 90, np.uint8)
+    cv2.circle(shot, (40, 30), 4, (255, 255, 255), -1)
+    cv2.imwrite("shot.png", shot)
+    with pytest.warns(UserWarning, match="angles depend"):
+        reconstruct(Path("shot.png"), known=PictureOptions(fov_deg=60.0))
+    assert (tmp_path / "reports/normals/shot/normals.csv").is_file()
+    written: list[Path] = []
+    drawn = SimpleNamespace(highlights=[], write=lambda out: written.append(out) or [])
+    monkeypatch.setattr("simtest.api.render", lambda *_: drawn)
+    render("plane")
+    render("plane", out=Path("here"))
+    assert written == [Path("reports/frames/plane"), Path("here")]
