@@ -202,13 +202,13 @@ def realism(
     from simtest.realism.page import write_comparison
 
     real, generated = open_frames(frames), open_generated(against, count, surfaces or ())
-    # Before the frames are measured, which takes long.
-    scenes = [len({frame.scene for frame in side}) for side in (real, generated)]
-    if min(scenes) < LEAST_SCENES:
-        told = f"{scenes[0]} real and {scenes[1]} generated scenes: a verdict needs {LEAST_SCENES} of each"
-        warnings.warn(told, stacklevel=2)
     stopped = "an earlier page stays; the same command begins anew"
     with exclusive_folder(out), progress_bar("compared", stopped) as progress:
+        # Before the frames are measured, which takes long.
+        scenes = [len({frame.scene for frame in side}) for side in (real, generated)]
+        if min(scenes) < LEAST_SCENES:
+            told = f"{scenes[0]} real and {scenes[1]} generated scenes: a verdict needs {LEAST_SCENES} of each"
+            warnings.warn(told, stacklevel=1)
         found = compare(real, generated, progress, seed or 0)
         page = write_comparison(found, out, against, command_line(), progress)
     return Told([page], found.to_json, _distances(found))
