@@ -156,10 +156,10 @@ def _summary(spots: "Specularities") -> Table:
     from simtest.reconstruction.records import SIGHTLINE_RULE
 
     groups: dict[tuple[str, str], list[Specularity]] = {}
-    rule, clouds = spots.sightline_rule, {spot.id for spot in spots.clouds}
+    rule = spots.sightline_rule
     for spot in spots:
         best = SIGHTLINE_RULE if spot.best in rule else spot.best or "none"
-        kind = "cloud" if spot.id in clouds else kind_name(spot.kind)
+        kind = kind_name(spot.kind) if spot.cloud is None else "cloud"
         groups.setdefault((kind, best), []).append(spot)
     rows = []
     for (kind, best), held in sorted(groups.items(), key=lambda item: -len(item[1])):

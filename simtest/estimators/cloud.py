@@ -140,7 +140,7 @@ class CloudCentre:
         light, estimates, refused = DiffuseLight(frame), list[Estimate](), list[Failure]()
         least_seen = LEAST_VERIFIABLE if light.shows and not priors.plane else LEAST_IN_VIEW
         for cloud, own in zip(groups.clouds, groups.spots, strict=True):
-            if len(own.peaks) >= self.least_spots and cloud.seen >= least_seen and groups.shows(cloud):
+            if len(own.peaks) >= self.least_spots and cloud.seen >= least_seen and groups.looks_in_view(cloud):
                 made = _estimate(cloud, own, groups, priors, light)
                 if isinstance(made, Failure):
                     refused.append(made)
@@ -198,7 +198,7 @@ class Groups:
         own = tuple(spots.of(owner == i) for i in range(len(mixture.clouds)))
         return cls(camera, window, frame.seen, mixture.clouds, own)
 
-    def shows(self, cloud: Cloud) -> bool:
+    def looks_in_view(self, cloud: Cloud) -> bool:
         """Return whether the pixel that a cloud's estimate looks at is in the view."""
         look_px = self.camera.project(cloud.sightline)
         if not (np.isfinite(look_px).all() and self.camera.contains(look_px)):
@@ -251,7 +251,7 @@ def _estimate(cloud: Cloud, spots: Spots, groups: Groups, priors: Priors, light:
         if isinstance(made, Failure):
             return made
         cloud, normal, budget = made
-        if not groups.shows(cloud):
+        if not groups.looks_in_view(cloud):
             return _unstated(count, "the diffuse light says that its centre lies out of view")
     else:
         normal = -cloud.centre

@@ -76,7 +76,7 @@ def reconstruct(
         known: focal length, centre and lens are then guesses, and their spread is in the uncertainty.
     estimators : sequence of str, or mapping
         Names as registered, or the estimators themselves by name; default `DEFAULT_ESTIMATORS`, and in pictures all
-        that the calibration states enough for (`default_estimators`).
+        that the calibration states enough for (`default_estimators`), and `cloud` on the whole of it.
     roi : tuple of int, optional
         Column, row, width, height of the one region of interest; default: regions detected in the frame.
     smoothing_px : float, optional
@@ -288,7 +288,7 @@ def _estimate(
         if box is None or _is_inside(estimate.look_px, box)
     ]
     # Clouds stand last.
-    spots.extend(sorted(undetected, key=lambda spot: any(each.cloud is not None for each in spot.normals.values())))
+    spots.extend(sorted(undetected, key=lambda spot: spot.cloud is not None))
     if options.target == "base":
         spots = [replace(spot, estimates={**spot.estimates, **spot.organ}) for spot in spots]
     return spots, no_cloud

@@ -125,8 +125,12 @@ class Specularity:
         if self.peak_px is not None:
             return self.peak_px
         x, y, width, height = self.region.box
-        looks = (each.look_px for each in self.normals.values() if each.cloud is not None)
-        return next(looks, np.array([x + width / 2, y + height / 2]))
+        return np.array([x + width / 2, y + height / 2]) if self.cloud is None else self.cloud.look_px
+
+    @property
+    def cloud(self) -> Estimate | None:
+        """The organ's normal from a cloud of highlights; None where it is a single highlight."""
+        return next((each for each in self.normals.values() if each.cloud is not None), None)
 
     @property
     def kind(self) -> str | None:
@@ -276,25 +280,21 @@ class Specularities(list[Specularity]):
     @property
     def clouds(self) -> list[Specularity]:
         """Those of its specularities that are clouds, each with the organ's normal."""
-        return [spot for spot in self if any(each.cloud is not None for each in spot.normals.values())]
+        return [spot for spot in self if spot.cloud is not None]
 
     @property
     def of_organ(self) -> str:
         """What tells the organ's normal, in a sentence; empty where nobody asked for clouds."""
-        if not (clouds := self.clouds):
-            return (
-                ""
-                if self.no_cloud is None
-                else f"no cloud of highlights tells the organ's normal: {self.no_cloud.detail}"
-            )
+        if self.no_cloud is not None:
+            return f"no cloud of highlights tells the organ's normal: {self.no_cloud.detail}"
         told = []
-        for spot in clouds:
-            estimate = next(each for each in spot.normals.values() if each.cloud is not None)
-            x, y = (round(float(v)) for v in estimate.look_px)
-            deviation = "" if estimate.deviation_deg is None else f" ± {estimate.deviation_deg:.2g} deg"
-            count = len(estimate.cloud.points_px) if estimate.cloud else 0
-            told.append(f"at ({x}, {y}) px{deviation}, from {count} highlights (no. {spot.id})")
-        return f"the organ's normal is told {'; '.join(told)}"
+        for spot in self:
+            if (estimate := spot.cloud) is not None and estimate.cloud is not None:
+                x, y = (round(float(v)) for v in estimate.look_px)
+                deviation = "" if estimate.deviation_deg is None else f" ± {estimate.deviation_deg:.2g} deg"
+                count = len(estimate.cloud.points_px)
+                told.append(f"at ({x}, {y}) px{deviation}, from {count} highlights (no. {spot.id})")
+        return f"the organ's normal is told {'; '.join(told)}" if told else ""
 
     @property
     def sightline_rule(self) -> tuple[str, ...]:

@@ -49,7 +49,9 @@ COLUMNS: dict[str, Column] = {
     "status": Column(TEXT, "`ok`, `missed`, or the reason of the failure"),
     "flags": Column(TEXT, "warnings of the estimate; the detail of a failure"),
     "error_deg": Column(
-        NUMBER, "proposed normal against the true one at the true BP, of the surface that `target` names, deg"
+        NUMBER,
+        "proposed normal against the true one at the true BP, of a cloud where it looks, of the surface that `target` "
+        "names, deg",
     ),
     "error_oracle_deg": Column(NUMBER, "error of the better candidate, deg"),
     "error_look_deg": Column(NUMBER, "error against the true normal at the pixel (`look_x_px`, `look_y_px`), deg"),

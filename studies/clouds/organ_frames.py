@@ -1,7 +1,7 @@
 """Frames of three organs whose relief is scaled to a slope, with the normals of their base; kept on disk."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,19 +73,28 @@ def organ_scene(organ: str, slope_deg: float, seed: int) -> dict[str, object]:
 
 def frames(first: int, many: int, folder: Path) -> Iterator[tuple[str, float, int, BaseFrame]]:
     """Yield organ, slope, deg, seed and frame; `many` of each organ and slope, seeds from `first` on."""
-    for o, organ in enumerate(ORGANS):
-        session = None
-        for i in range(many):
-            for s, slope in enumerate(SLOPES_DEG):
-                seed = first + 1000 * o + len(SLOPES_DEG) * i + s
-                try:
-                    frame, session = load(
-                        organ_scene(organ, slope, seed), folder / f"{organ}_{slope:g}_{seed}.npz", session
-                    )
-                except SimtestError as error:
-                    print(f"{organ}, {slope:g} deg, seed {seed}: {error}")
-                    continue
-                yield organ, slope, seed, frame
+    yield from loaded(
+        (
+            (organ, slope, first + 1000 * o + len(SLOPES_DEG) * i + s)
+            for o, organ in enumerate(ORGANS)
+            for i in range(many)
+            for s, slope in enumerate(SLOPES_DEG)
+        ),
+        folder,
+    )
+
+
+def loaded(cases: Iterable[tuple[str, float, int]], folder: Path) -> Iterator[tuple[str, float, int, BaseFrame]]:
+    """Yield organ, slope, deg, seed and frame of each case, organs one after the other; say which cannot be made."""
+    session, of = None, ""
+    for organ, slope, seed in cases:
+        session, of = (session if organ == of else None), organ
+        try:
+            frame, session = load(organ_scene(organ, slope, seed), folder / f"{organ}_{slope:g}_{seed}.npz", session)
+        except SimtestError as error:
+            print(f"{organ}, {slope:g} deg, seed {seed}: {error}")
+            continue
+        yield organ, slope, seed, frame
 
 
 def load(data: dict[str, object], file: Path, session: Session | None) -> tuple[BaseFrame, Session | None]:

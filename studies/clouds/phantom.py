@@ -1,7 +1,7 @@
 """The phantom's frame against its registered normals: python -m studies.clouds.phantom FOLDER.
 
 FOLDER holds color.png, normals.png and config.ini of C3VD's sample. The frame is read as it is, at other JPEG
-qualities, cropped to three quarters, and at half its size; the light is not given. Nothing is fitted to it.
+qualities, cropped to three quarters, and at half its size; the light is not given. No constant is fitted to it.
 """
 
 import argparse
@@ -19,14 +19,12 @@ import simtest
 from simtest.calibration import Calibration
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction import Specularities
-from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array
 from simtest.spec.calibration_file import load_calibration
 from simtest.validation.references import load_map_reference
+from studies.clouds.scores import RADIUS
 
 QUALITIES = (95, 80, 60)
-SQUARED = math.sqrt(chi_squared.quantile(0.95, 2) / 2)
-"""Radius of a round 95 % region over the rms."""
 
 
 def variants(folder: Path) -> Iterator[tuple[str, Array, Array, Calibration, Array, float]]:
@@ -62,7 +60,7 @@ def rows(name: str, spots: Specularities, normals: Array, origin: Array, scale: 
         estimate = spot.normals["cloud"]
         x, y = (int(v) for v in estimate.look_px)
         look, error = scale * estimate.look_px + origin, float(angle_deg(estimate.normal, normals[y, x]))
-        radius = SQUARED * (estimate.deviation_deg or math.nan)
+        radius = RADIUS * (estimate.deviation_deg or math.nan)
         made.append(
             f"| {name} | ({look[0]:.0f}, {look[1]:.0f}) | {error:.1f} | {radius:.1f} | {', '.join(estimate.flags)} |"
         )
@@ -86,7 +84,7 @@ def main() -> None:
                 if stated is not None and stated.cloud is None and stated.deviation_deg is not None:
                     x, y = (int(v) for v in stated.look_px)
                     errors.append(float(angle_deg(stated.normal, normals[y, x])))
-                    radii.append(SQUARED * stated.deviation_deg)
+                    radii.append(RADIUS * stated.deviation_deg)
             off, held = np.array(errors), np.array(errors) <= np.array(radii)
             known = np.isfinite(off)
             singles = (

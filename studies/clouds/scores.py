@@ -1,5 +1,6 @@
 """How the estimates of clouds stand against the base: errors, coverage, and the relief's slope."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -28,6 +29,8 @@ WARNINGS = {"base_unverified", "cut", "wide"}
 """Flags with which a false answer is no sure one."""
 
 REGION = chi_squared.quantile(0.95, 2)
+RADIUS = math.sqrt(REGION / 2)
+"""Of a round 95 % region, over the rms."""
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,9 @@ import numpy as np
 
 import simtest
 from simtest.calibration.priors import UNTOLD_SLOPE_RAD
-from simtest.errors import SimtestError
 from simtest.geometry.vectors import angle_deg
-from simtest.runtime import chi_squared
-from studies.clouds.organ_frames import ORGANS, BaseFrame, load, organ_scene
+from studies.clouds.organ_frames import ORGANS, BaseFrame, loaded
+from studies.clouds.scores import RADIUS
 from studies.kept import of_this_code
 
 SLOPES_DEG = ((3.0, 6.0), (6.0, 10.0), (10.0, 15.0), (15.0, 20.0))
@@ -42,7 +41,7 @@ def judged(frame: BaseFrame, told: bool) -> list[tuple[float, float, bool]]:
             continue
         error = float(angle_deg(stated.normal, truth))
         rms = math.degrees(math.sqrt(float(np.trace(stated.covariance))))
-        rows.append((error, rms, error <= rms * math.sqrt(chi_squared.quantile(0.95, 2) / 2)))
+        rows.append((error, rms, error <= RADIUS * rms))
     return rows
 
 
@@ -55,18 +54,10 @@ def main() -> None:
     asked = parser.parse_args()
     folder = asked.frames or of_this_code(Path("reports/studies/singles"))
     found: list[tuple[str, float, bool, list[tuple[float, float, bool]]]] = []
-    for organ in ORGANS:
-        session = None
-        for seed in range(asked.first, asked.first + asked.many):
-            slope = drawn(organ, seed)
-            try:
-                frame, session = load(
-                    organ_scene(organ, slope, seed), folder / f"{organ}_{slope:.2f}_{seed}.npz", session
-                )
-            except SimtestError as error:
-                print(f"{organ}, seed {seed}: {error}")
-                continue
-            found += [(organ, slope, told, judged(frame, told)) for told in (True, False)]
+    seeds = range(asked.first, asked.first + asked.many)
+    cases = ((organ, drawn(organ, seed), seed) for organ in ORGANS for seed in seeds)
+    for organ, slope, _, frame in loaded(cases, folder):
+        found += [(organ, slope, told, judged(frame, told)) for told in (True, False)]
     print("| light | frames | n | highlights | error, median | 95th percentile | rms stated, median | inside |")
     print("|---|---|---|---|---|---|---|---|")
     for told in (True, False):

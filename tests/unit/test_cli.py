@@ -710,12 +710,12 @@ def test_a_command_prints_the_record_that_it_returns(capsys):
 class Spots(list):
     """Specularities without an estimate or a reference: two of three isolated, the others clusters."""
 
-    reference, sightline_rule, clouds = None, (), ()
+    reference, sightline_rule = None, ()
 
     def __init__(self, count):
         super().__init__(
             SimpleNamespace(id=i, kind="cluster" if i % 3 == 0 else "isolated", score=0.5, best=None,
-                            best_estimate=None, peak_px=(1.0, 2.0), normals={})
+                            best_estimate=None, cloud=None, peak_px=(1.0, 2.0), normals={})
             for i in range(count)
         )  # fmt: skip
 
