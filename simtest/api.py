@@ -150,7 +150,7 @@ def sample_views(
     fps: float | None = None,
     labels: bool = False,
 ) -> "SampledViews":
-    """Pick viewpoints of an anatomy that show isolated highlights, or follow its camera path (docs/howto/sequences.md).
+    """Pick viewpoints of an anatomy that show isolated highlights, or follow its camera path (docs/howto/scenes.md).
 
     At most ten viewpoints are tried for each view wanted. `along` are the first and last share of the camera path: a
     sequence of `count` views evenly spaced between them, at `fps` frames a second (default 25), with optical flow and
@@ -204,7 +204,7 @@ def validate(
     engine : Engine, optional
         What runs the work, in place of `workers` (see `simtest.runtime.processes.make_engine`).
     export : str or Path, optional
-        Folder for the frames without their truth, for methods that run elsewhere (docs/howto/score.md).
+        Folder for the frames without their truth, for methods that run elsewhere (docs/howto/scoring.md).
     charts : bool
         Whether the charts of the page are written as PNG files too.
     **overrides

@@ -28,7 +28,7 @@ DEFAULT_SMOOTHING_PX = 2.0
 
 PAPER_SMOOTHING_PX = 3.0
 """The same in the published protocol, in px. The article does not state it; its slope against n and its best isovalue
-are those of about 3 px (docs/gallery/experiments_measured.md)."""
+are those of about 3 px (docs/measured/published.md)."""
 
 CIRCLE_POSE_ISOVALUE = 0.5
 """Default isovalue of `circle_pose` in rendered experiments."""
@@ -64,7 +64,7 @@ SPECULAR_MIN_AREA_PX = 12
 """A highlight of fewer pixels need not be found: no ellipse can be fitted to it."""
 
 EDGES_PER_HALF_WIDTH = 2.0
-"""Edges needed in a half-width: with two, the triangles cost less than 0.05 deg and 1 % (docs/howto/meshes.md)."""
+"""Edges needed in a half-width: with two, the triangles cost less than 0.05 deg and 1 % (docs/howto/scenes.md)."""
 
 ON_INSTRUMENT = "on_instrument"
 """Column of results of scenes with instruments: whether a detection shows one, and no true highlight."""
@@ -76,4 +76,4 @@ MOTION_COLUMNS = (
     "motion_over_d", "motion_sign_1", "motion_sign_2", "motion_gain_1", "motion_gain_2", "motion_margin_1",
     "motion_margin_2", "motion_distance2", "motion_fits",
 )  # fmt: skip
-"""Columns of results of scenes with further views, all numbers (docs/howto/motion.md)."""
+"""Columns of results of scenes with further views, all numbers (docs/howto/pictures.md)."""

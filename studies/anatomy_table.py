@@ -1,4 +1,4 @@
-"""Print the table of docs/gallery/experiments_measured.md, "Curved anatomy": found, false detections and errors.
+"""Print the table of docs/measured/anatomy.md: found, false detections and errors.
 
 python -m studies.anatomy_table colon 1000 1400 FOLDER
 

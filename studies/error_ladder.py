@@ -1,6 +1,6 @@
 """The error ladder: the error that remains when the input of each stage is replaced by the exact one.
 
-`python -m studies.error_ladder` prints the table of docs/gallery/error_ladder.md; seconds.
+`python -m studies.error_ladder` prints the table of docs/measured/error_ladder.md; seconds.
 
 The scenes have closed forms, so the exact input of every stage is known: the frame without noise, the isophote between
 the pixels, its cone, the normal itself. The light is at the camera.

@@ -4,7 +4,7 @@
 
 The meshes are those of ../shared/data/meshes. They are smooth, in tissue's colours, lit at the camera, and seen through
 the sensor preset colonoscope_hd; reconstruction is told light, lens and response, and finds highlights by colour, as it
-does in pictures. Truth is that of the mesh's interpolated normals (docs/howto/meshes.md).
+does in pictures. Truth is that of the mesh's interpolated normals (docs/howto/scenes.md).
 """
 
 import sys

@@ -1,6 +1,6 @@
 """How well a small classifier tells real crops from generated ones, scenes held out.
 
-Print the table of docs/realism.md, section "A classifier":
+Print the table of docs/howto/realism.md, section "A classifier":
 
     python -m studies.realism_classifier REAL... --against FOLDER...
 

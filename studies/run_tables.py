@@ -21,7 +21,7 @@ _GAIN = "sensor.exposure.gain"
 
 
 def curvature(run: Run) -> Rows:
-    """Yield docs/concepts/theory.md, section 3: a row for each setting."""
+    """Yield docs/measured/curvature.md: a row for each setting."""
     results = run.results
     yield ["surface", "d k", "axis ratio: law (3.2)", "axis ratio: measured", "circle pose: law (4.1), deg",
            "circle pose, better candidate, deg", "brightest point, deg", "cone axis, deg"]  # fmt: skip
@@ -41,7 +41,7 @@ def curvature(run: Run) -> Rows:
 
 
 def sensor(run: Run) -> Rows:
-    """Yield docs/gallery/experiments_measured.md, "The sensor": means of cone_axis, a row for each sweep."""
+    """Yield docs/measured/sensor.md: means of cone_axis, a row for each sweep."""
     results = run.results
     yield ["sweep", "plane", "cylinder"]
     answered = _of(results.filter(OK), "cone_axis")
@@ -65,7 +65,7 @@ def sensor(run: Run) -> Rows:
 
 
 def rig(run: Run) -> Rows:
-    """Yield docs/gallery/experiments_measured.md, "Rigs": medians, a row for each surface and rig."""
+    """Yield docs/measured/rig.md: medians, a row for each surface and rig."""
     results = run.results
     yield ["surface", "rig", "true highlights", "found", "law, deg", "brightest_point, deg", "cone_axis, deg"]
     true = results.filter(pl.col("true_id").is_not_null())
@@ -82,7 +82,7 @@ def rig(run: Run) -> Rows:
 
 
 def interreflection(run: Run) -> Rows:
-    """Yield docs/gallery/experiments_measured.md, "Inter-reflections": medians of cone_axis."""
+    """Yield docs/measured/sensor.md: medians of cone_axis."""
     results = run.results
     yield ["radius, mm", "albedo", "direct", "bounces"]
     keys = "surface.radius_mm", "reflectance.diffuse"
@@ -93,7 +93,7 @@ def interreflection(run: Run) -> Rows:
 
 
 def camera(run: Run) -> Rows:
-    """Yield docs/gallery/experiments_measured.md, "Lenses": means of cone_axis, and in brackets of circle_pose."""
+    """Yield docs/measured/sensor.md: means of cone_axis, and in brackets of circle_pose."""
     results = run.results
     angles = [0.5, 10.0, 20.0, 40.0, 60.0]
     yield ["lens", *(f"{angle:g} deg" for angle in angles)]
@@ -108,7 +108,7 @@ def camera(run: Run) -> Rows:
 
 
 def known_light(run: Run) -> Rows:
-    """Yield docs/concepts/which_method.md, "Light beside the camera": mean errors of bisector."""
+    """Yield docs/measured/light_offset.md: mean errors of bisector."""
     results = run.results
     yield ["distance given", "cone_axis", "bisector"]
     for (setting,), rows in results.filter(OK).group_by("setting", maintain_order=True):
@@ -117,7 +117,7 @@ def known_light(run: Run) -> Rows:
 
 
 def relief(run: Run) -> Rows:
-    """Yield docs/gallery/experiments_measured.md, "Relief": mean errors, a row for each sweep."""
+    """Yield docs/measured/relief.md: mean errors, a row for each sweep."""
     results = run.results
     yield ["sweep", "highlights", "cone_axis", "brightest_point", "circle_pose (answers)", "cone_axis over the law"]
     answered = results.filter(OK & pl.col("true_id").is_not_null())
@@ -138,7 +138,7 @@ def relief(run: Run) -> Rows:
 
 
 def reflectance(run: Run) -> Rows:
-    """Yield docs/gallery/experiments_measured.md, "Other reflectances": answers and errors of each estimator."""
+    """Yield docs/measured/reflectance.md: answers and errors of each estimator."""
     results = run.results
     yield ["estimator", "answers", "why none", "error, deg: median (largest) of how many"]
     for name in ("cone_axis", "brightest_point", "circle_pose"):
@@ -159,14 +159,14 @@ def reflectance(run: Run) -> Rows:
 
 
 def laws(run: Run) -> Rows:
-    """Yield docs/gallery/experiments_measured.md, "The error laws"."""
+    """Yield docs/measured/laws.md."""
     yield ["law", "settings met", "predicted", "largest departure, as a share of the law", "where"]
     for result in law_results(run):
         yield [result.law.title, *(result.cells[key] for key in ("met", "range", "share", "where"))]
 
 
 def compare(run: Run) -> Rows:
-    """Yield docs/gallery/estimators_measured.md, "All estimators on the same frames": means, a row for each surface."""
+    """Yield docs/measured/compare.md: means, a row for each surface."""
     normals = ("cone_axis", "bisector", "photometric", "inverse_rendering")
     curvatures = ("curved", "inverse_rendering")
     heads = [*normals, *(f"gains: {name}" for name in curvatures), f"direction: {', '.join(curvatures)}"]
@@ -189,7 +189,7 @@ def compare(run: Run) -> Rows:
 
 
 def motion(run: Run) -> Rows:
-    """Yield docs/howto/motion.md, "How accurate": shares of the signs that are given."""
+    """Yield docs/measured/motion.md: shares of the signs that are given."""
     lengths = [0.2, 0.5, 1.0, 2.0, 5.0]
     yield ["surface, d k", *(f"{length:g} mm" for length in lengths)]
     surfaces = {
@@ -217,6 +217,15 @@ def motion(run: Run) -> Rows:
     yield [f"{total} signs of {2 * rows.height} are given, {wrong} of them are wrong", *[""] * len(lengths)]
 
 
+def paper(run: Run) -> Rows:
+    """Yield docs/measured/published.md: errors of the better candidate and the Cramer-Rao bound, a row each setting."""
+    yield ["setting", "answered", "mean, deg", "largest, deg", "Cramer-Rao bound, deg"]
+    for (setting,), rows in run.results.group_by("setting", maintain_order=True):
+        error, bound = rows.filter(OK)["error_oracle_deg"], rows["bound_deg"].mean()
+        figures = _number(error.mean(), 2), _number(error.max(), 2), _number(bound, 3)
+        yield [str(setting), f"{len(error)} of {rows.height}", *figures]
+
+
 TABLES: dict[str, Callable[[Run], Rows]] = {
     table.__name__: table
     for table in (
@@ -231,6 +240,7 @@ TABLES: dict[str, Callable[[Run], Rows]] = {
         laws,
         compare,
         motion,
+        paper,
     )
 }
 

@@ -247,8 +247,8 @@ def score(
     Parameters
     ----------
     answers : Path
-        Table of normals, CSV or Parquet: frame, x_px, y_px, normal_x, normal_y, normal_z (docs/howto/score.md). Or a
-        folder of maps of normals or depths, or the word shading, for a score of every pixel (docs/howto/dense.md).
+        Table of normals, CSV or Parquet: frame, x_px, y_px, normal_x, normal_y, normal_z (docs/howto/scoring.md). Or a
+        folder of maps of normals or depths, or the word shading, for a score of every pixel (docs/howto/scoring.md).
     """
     if is_dense(answers):
         return score_dense(answers, on, out, how.named(name))

@@ -7,6 +7,6 @@
     draw(judged, ...)           # reports, `page`, `outputs` (JSON, Markdown)
 
 `compare` pairs the rows of the cells that differ, tests them (`contrasts`) for the `quantities` against their margins,
-and corrects the p-values; the tests' error rates are measured (docs/gallery/gate_measured.md). `words` says in
+and corrects the p-values; the tests' error rates are measured (docs/measured/gate.md). `words` says in
 sentences what was found. `store` names the folders, writes a run, keeps the history and accepts a baseline.
 """

@@ -396,7 +396,7 @@ STEPS = {
     "curvature": Step(pl.col("kd_min"), "", 1e-4, 1e-3, of_answers=False),
     "larger curvature": Step(pl.col("kd_max"), "", 1e-4, 1e-3, of_answers=False),
 }  # fmt: skip
-"""Numbers of a result by name. Other rounding moved errors by 3.2e-5 deg at most (docs/gallery/gate_measured.md)."""
+"""Numbers of a result by name. Other rounding moved errors by 3.2e-5 deg at most (docs/measured/gate.md)."""
 
 _KEY = (*CELL, "realisation", "true_id", "seed")
 _LOST_HALF = 0.5

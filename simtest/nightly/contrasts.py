@@ -1,7 +1,7 @@
 """One-sided tests of "worse by more than the margin", of many cells at once: a studentised mean with Student's tail.
 
 Resampling cannot reach the levels that a family of hundreds of tests asks for (1e-5 and less) with the ten or twenty
-units of a setting: signs of ten differences have 2^10 patterns. Student's tail can, and docs/gallery/gate_measured.md
+units of a setting: signs of ten differences have 2^10 patterns. Student's tail can, and docs/measured/gate.md
 has its measured error rates. A unit is a realisation, a scene or a pose, whatever number of highlights it shows: a mean
 of rows is a ratio of sums over units, and its variance is that of the units' residuals about it.
 """

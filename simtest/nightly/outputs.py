@@ -1,4 +1,4 @@
-"""The verdict without the page: JSON, and Markdown that fits a comment on a pull request (docs/howto/run_in_ci.md)."""
+"""The verdict without the page: JSON, and Markdown that fits a comment on a pull request (docs/howto/nightly.md)."""
 
 import math
 from collections.abc import Sequence

@@ -121,7 +121,7 @@ def constraints_arrays(found: Specularities) -> dict[str, npt.NDArray[np.generic
 
     The normal and its covariance are those of the surface at the highlight's brightest point, wherever that is; the
     pixel, at which the best normal looks, is where it is estimated. Of the surface on the sightline through that pixel
-    the normal is the same, with `covariance_at_pixel`. docs/howto/constraints.md lists the arrays.
+    the normal is the same, with `covariance_at_pixel`. docs/howto/pictures.md lists the arrays.
     """
     answered = ((spot, spot.best, best) for spot in found if (best := spot.best_estimate) is not None)
     made = [each for each in answered if np.isfinite(found.camera.unproject(each[2].look_px)).all()]

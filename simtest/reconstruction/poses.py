@@ -1,7 +1,7 @@
 """Poses of the camera over the frames of a sequence, from a file.
 
 It is views.json, a list of matrices, a TUM trajectory, a file of COLMAP or NeRF, or that of a public data set of
-colonoscopy. docs/howto/motion.md describes the formats.
+colonoscopy. docs/howto/pictures.md describes the formats.
 
 C3VD writes camera-to-world matrices, 16 numbers a line, mm. Its loader takes them for row vectors, with the translation
 in the last row; its page calls them row-major, and that of its successor column-major. Where the translation stands
@@ -222,7 +222,7 @@ def _from_json(text: str, where: str) -> Read:
             if matrix is None and NERF in entry:
                 raise InputError(
                     f"{at}: no {' or '.join(MATRICES)} but {NERF}, whose camera has y up and z backward; "
-                    "docs/howto/motion.md shows how to convert it"
+                    "docs/howto/pictures.md shows how to convert it"
                 )
             named = next((entry[key] for key in NAMES if entry.get(key) is not None), None)
             if named is not None and not isinstance(named, str):

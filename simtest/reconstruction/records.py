@@ -1,6 +1,6 @@
 """The record of what was reconstructed: a specularity with its estimates and the best of them, and those of a picture.
 
-docs/howto/reconstruct.md explains the keys of their JSON. It is what the tables, the overlay and the pages are made of.
+docs/howto/pictures.md explains the keys of their JSON. It is what the tables, the overlay and the pages are made of.
 """
 
 import statistics

@@ -1,4 +1,4 @@
-"""Mitsuba plugins of simtest, for scenes that Mitsuba loads without simtest (see docs/howto/export.md).
+"""Mitsuba plugins of simtest, for scenes that Mitsuba loads without simtest (see docs/howto/scenes.md).
 
 One line before `mi.load_file` or `mi.load_dict`, after `mi.set_variant`::
 

@@ -43,7 +43,7 @@ class RunResults:
 
     @cached_property
     def results(self) -> "pl.DataFrame":
-        """results.parquet: a row for each realisation, specularity and estimator (docs/reference/experiments.md)."""
+        """results.parquet: a row for each realisation, specularity and estimator (docs/howto/experiments.md)."""
         import polars as pl
 
         return pl.read_parquet(self.folder / "results.parquet", hive_partitioning=False)

@@ -24,7 +24,7 @@ MOST_APART = 32
 COVISIBILITY, FLOW_SHEET = "covisibility.npy", "flow_sheet.png"
 
 FILES = ("flow_*.npz", COVISIBILITY, FLOW_SHEET)
-"""What is written, as patterns; docs/howto/make_a_film.md says what it holds."""
+"""What is written, as patterns; docs/howto/scenes.md says what it holds."""
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,7 @@ class SurfaceCalibration(Spec):
     )
     relief_slope_deg: Annotated[float, Field(ge=0, le=45)] | Interval | None = Field(
         None,
-        description="slope of the relief an axis, deg: a number, or the interval that it lies in; default [0, 9]",
+        description="slope of the relief an axis, deg: a number, or the interval that it lies in; default [3, 20]",
     )
 
     @model_validator(mode="after")

@@ -158,7 +158,7 @@ class Experiment(Spec):
     ('overview', True)
     """
 
-    name: Name
+    name: Name = Field(description="seeds depend on it; default the name of the file")
     title: str = ""
     description: str = ""
     realisations: int = Field(20, ge=1, le=10**6)
@@ -421,7 +421,7 @@ class Family(Spec):
 class Dataset(Spec):
     """A labelled dataset."""
 
-    name: Name
+    name: Name = Field(description="default the name of the file")
     title: str = ""
     description: str = ""
     samples: int = Field(1000, ge=1, le=MAX_SAMPLES)

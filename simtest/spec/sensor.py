@@ -1,4 +1,4 @@
-"""From radiance to a picture: the sensor, its video processor, and both by name (docs/realism.md)."""
+"""From radiance to a picture: the sensor, its video processor, and both by name (docs/howto/realism.md)."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal

@@ -2,7 +2,7 @@
 
 A row is a dictionary of the columns that are known, by name; what it lacks is null. Rows are made by `scoring.rows`,
 `scoring.cloud_rows` and, of the published protocol, `paper.rows.paper_rows`. The manual's page of files is made from
-`COLUMNS`; docs/reference/experiments.md explains them by topic, as a test checks. Angles of errors are between an
+`COLUMNS`; docs/howto/experiments.md explains them by topic, as a test checks. Angles of errors are between an
 estimate's proposed normal and a true one, in degrees. BP is the highlight's brightest point. "Law" is a closed form of
 docs/concepts/theory.md.
 """

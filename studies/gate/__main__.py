@@ -1,4 +1,4 @@
-"""Print the tables of docs/gallery/gate_measured.md: `python -m studies.gate [SECTION]...`, all sections by default.
+"""Print the tables of docs/measured/gate.md: `python -m studies.gate [SECTION]...`, all sections by default.
 
 `python -m studies.gate figures` prints the figures beside their limits. The bank of 20,400 realisations takes 10
 minutes of processor time and is kept in the folder that GATE_BANK names (default: gate-bank in the system's folder for

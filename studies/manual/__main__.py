@@ -6,9 +6,9 @@
     python -m studies.manual commands [PAGE...] [--quick] [--timeout S] [--log FILE]
                                                         run every `sh` and `python` block, page by page, and compare
                                                         what they print with what the page shows
-    python -m studies.manual figures [PAGE...] [--cheap] [--timeout S]
+    python -m studies.manual figures [PAGE...] [--cheap] [--write] [--timeout S]
                                                         make the tables anew that name their command, and compare their
-                                                        numbers
+                                                        numbers, or write them
 
 Each exits with 1 where something is wrong, and names it.
 """
@@ -35,6 +35,7 @@ def main() -> int:
     figures = checks.add_parser("figures", help="make the tables of measured figures anew")
     figures.add_argument("pages", nargs="*", type=Path)
     figures.add_argument("--cheap", action="store_true", help="leave out what takes more than 20 s of processor time")
+    figures.add_argument("--write", action="store_true", help="write the numbers that differ into the pages")
     figures.add_argument("--timeout", type=float, default=3600.0, help="seconds that a command may take")
     return _run(parser.parse_args())
 
@@ -53,7 +54,7 @@ def _run(given: argparse.Namespace) -> int:
     if given.check == "figures":
         from studies.manual.figures import check_figures
 
-        return check_figures(pages, given.cheap, given.timeout)
+        return check_figures(pages, given.cheap, given.timeout, given.write)
     if given.check == "links":
         from studies.manual.links import dead_links
 

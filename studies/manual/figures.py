@@ -10,6 +10,9 @@ others within one unit in their last digit, which another processor can cause. M
 
 - `within: 5 %` allows so much in place of one unit, where that is more;
 - `part` allows further numbers in a printed row, as columns that the page leaves out.
+
+With `--write` a row that differs takes the numbers of the printed row in the place of its own, words and form as they
+are; a table of a `part` is left to its reader.
 """
 
 import math
@@ -66,24 +69,36 @@ def tables_of(path: Path) -> Iterator[Table]:
 
 def differences(table: Table, printed: str) -> list[str]:
     """Return a line for each row of a table that is not printed, with what is printed in its place."""
+    return [
+        f"{' | '.join(cell.strip() for cell in cells)}: {', '.join(wrong)}"
+        for cells, _, wrong in _nearest(table, printed)
+        if wrong
+    ]
+
+
+def renewed(table: Table, printed: str, text: str) -> str:
+    """Return the text of a page, the rows of its table that differ with the numbers that are printed."""
+    for cells, row, wrong in _nearest(table, printed):
+        if wrong and row and not table.part:
+            line = f"|{'|'.join(cells)}|"
+            words = NUMBER.split(line)
+            text = text.replace(line, "".join(word + number for word, number in zip(words, [*row, ""], strict=True)))
+    return text
+
+
+def _nearest(table: Table, printed: str) -> Iterator[tuple[tuple[str, ...], list[str] | None, list[str]]]:
+    """Yield each row with numbers, those of the printed row that is nearest to it, and in what they differ."""
     left = [numbers for line in printed.splitlines() if (numbers := NUMBER.findall(line))]
-    found = []
     for cells in table.rows:
-        text = " | ".join(cell.strip() for cell in cells)
-        shown, first = NUMBER.findall(text), len(NUMBER.findall(cells[0]))
+        shown, first = NUMBER.findall(" | ".join(cells)), len(NUMBER.findall(cells[0]))
         fitting = [
             (_wrong(shown, row, first, table), i) for i, row in enumerate(left) if _fits(shown, row, first, table)
         ]
-        if not shown:
-            continue
-        if not fitting:
-            found.append(f"{text}: no such row is printed")
-            continue
-        wrong, nearest = min(fitting, key=lambda each: len(each[0]))
-        if wrong:
-            found.append(f"{text}: {', '.join(wrong)}")
-        del left[nearest]
-    return found
+        if shown and fitting:
+            wrong, nearest = min(fitting, key=lambda each: len(each[0]))
+            yield cells, left.pop(nearest), wrong
+        elif shown:
+            yield cells, None, ["no such row is printed"]
 
 
 def _fits(shown: Sequence[str], row: Sequence[str], first: int, table: Table) -> bool:
@@ -117,9 +132,9 @@ def _value(number: str) -> float:
     return float(number.replace(",", ""))
 
 
-def check_figures(pages: Sequence[Path] | None, cheap: bool, timeout_s: float) -> int:
-    """Make the tables of the pages anew and print what differs; return 1 if anything does, or a command fails."""
-    tables = [table for page in pages or manual_pages() for table in tables_of(page)]
+def check_figures(pages: Sequence[Path] | None, cheap: bool, timeout_s: float, write: bool = False) -> int:
+    """Make the tables of the pages anew, print and `write` what differs; return 1 if anything does, or none is made."""
+    tables = [(page, table) for page in pages or manual_pages() for table in tables_of(page)]
     failed = 0
     with tempfile.TemporaryDirectory(prefix="manual-") as folder:
         # Data that is not ours lies beside the checkout.
@@ -129,7 +144,7 @@ def check_figures(pages: Sequence[Path] | None, cheap: bool, timeout_s: float) -
         if data.is_dir():
             (Path(folder) / data.name).symlink_to(data)
         printed: dict[str, tuple[bool, str]] = {}
-        for table in tables:
+        for page, table in tables:
             if cheap and table.minutes > CHEAP:
                 print(f"left out          {table.place}: {table.minutes:g} minutes")
                 continue
@@ -139,7 +154,10 @@ def check_figures(pages: Sequence[Path] | None, cheap: bool, timeout_s: float) -
                     printed[part] = shell(f"OUT={scratch / 'out'}; {part}", scratch, timeout_s)
             runs = [printed[part] for part in table.command.split(" && ")]
             broken = [text[-1000:] for succeeded, text in runs if not succeeded]
-            found = broken or differences(table, "\n".join(text for _, text in runs))
+            made = "\n".join(text for _, text in runs)
+            found = broken or differences(table, made)
+            if write and found and not broken:
+                page.write_text(renewed(table, made, page.read_text(encoding="utf-8")), encoding="utf-8")
             print(f"{'DIFFERS' if found else 'ok':>8} {time.monotonic() - started:6.1f} s {table.place}", flush=True)
             print("".join(f"         {line}\n" for line in found), end="", flush=True)
             failed += bool(found)

@@ -33,7 +33,7 @@ and `visible_highlights.instrument` exist where the scene lists instruments.
 
 ## Normals of a picture
 
-`simtest reconstruct` writes these files; [Reconstructing a picture](../howto/reconstruct.md) explains how to read them.
+`simtest reconstruct` writes these files; [Pictures](../howto/pictures.md) explains how to read them.
 
 ### normals.json
 
@@ -57,7 +57,7 @@ A row for each specularity, estimator and candidate, with the columns @CSV.
 
 ## A run of an experiment
 
-`simtest validate` writes these files; [Experiments and their results](experiments.md) explains them.
+`simtest validate` writes these files; [Experiments](../howto/experiments.md) explains them.
 
 ### results.parquet
 
@@ -65,6 +65,14 @@ A row for each estimator at each detected or missed highlight. The swept paramet
 names. BP is the highlight's brightest point; sections are those of [theory](../concepts/theory.md).
 
 @RESULTS
+
+Runs with instruments have `on_instrument`: the index of the instrument that a detection shows. Runs with further
+views have rows of the estimator `motion`, with the status `ok` where both signs are decided, else `undecided`:
+`motion_over_d` (motion over distance), and for each estimated principal direction `motion_sign_1`, `motion_sign_2`
+(decided sign of 1 + d k; 0: undecided), `motion_gain_1`, `motion_gain_2` (true 1 + d k) and `motion_margin_1`,
+`motion_margin_2` (twice the log of the likelihood ratio of both signs); `motion_distance2` (squared Mahalanobis
+distance of the best curvature) and `motion_fits` (1: it explains the views). Runs of the published protocol have a
+column for each key `paper.*` and `bound_deg`, the Cramer-Rao bound.
 
 ### summary.json
 
@@ -80,9 +88,25 @@ The environment (versions, machine) stands beside them.
 
 @FIGURES
 
+#### Beside the settings
+
+`experiments.NAME` also has `title`, `description`, `realism` (which kind of realism the scenes stand for), `frames`
+(their number), `faults` (errors inside estimators and cores: `estimator`, `reason`, `text`, `count`), `estimators`
+(a sentence each) and `conditions`: by setting `told` (what estimators know of the lights), `relief`, `sensor`,
+`render`, `camera`, `half_width_rad` (of the lobe; null where the reflectance has none) and `focal_px`.
+
+### guide.json
+
+The table of situations. `rows` has an object for each: `surface`, `circumstances`, `settings`, `target` (`fine` or
+`base`), `best`, `ties` (methods that cannot be distinguished from it), `unranked` (why the order is open, or
+empty), `error`, `answered`, `unanswered`, `breaks`, `is_broken` (the best method's figures in words), `methods` and
+`best_by_setting` with the figures `n`, `answered`, `missed`, `refused`, `failed`, `median_deg`, `mean_deg`,
+`interval_deg` (95 % of the median; null below 5 frames), `mean_penalised_deg` and `breaks`. `methods`, `shared`,
+`seen`, `left_out`, `rules` and `words` explain the table.
+
 ## A dataset
 
-`simtest dataset` writes shards, tables, manifest.json and README.md; [Datasets for learning](../howto/datasets.md)
+`simtest dataset` writes shards, tables, manifest.json and README.md; [Datasets](../howto/datasets.md)
 explains them.
 
 ### Images of a sample

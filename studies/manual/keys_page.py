@@ -5,17 +5,20 @@ from typing import Any
 from pydantic import BaseModel
 
 from simtest.spec import CalibrationSpec, CameraSpec, Dataset, Experiment, Profile, Scene
+from simtest.spec.recipes import PaperScene
 
 MODELS: dict[str, tuple[str, type[BaseModel]]] = {
-    "scene": ("A scene: what is rendered. [Scenes](scenes.md) explains it.", Scene),
-    "experiment": ("An experiment: groups of settings. [Experiments](experiments.md) explains it.", Experiment),
+    "scene": ("A scene: what is rendered. [Scenes](../howto/scenes.md) explains it.", Scene),
+    "experiment": ("Groups of settings. [Experiments](../howto/experiments.md) explains it.", Experiment),
     "dataset": ("A recipe of labelled frames. [Datasets](../howto/datasets.md) explains it.", Dataset),
     "camera": ("A camera. [Cameras](../howto/cameras.md) explains it.", CameraSpec),
     "calibration": ("A camera and what else is known of its pictures. "
-                    "[Reconstructing a picture](../howto/reconstruct.md) explains it.", CalibrationSpec),
+                    "[Cameras](../howto/cameras.md) explains it.", CalibrationSpec),
     "profile": ("What a nightly run consists of. [Nightly reports](../howto/nightly.md) explains it.", Profile),
+    "published": ("A scene of the published protocol: the texture of the specular term on a plane, seen slanted by a "
+                  "camera that is not at the light; nothing is rendered.", PaperScene),
 }  # fmt: skip
-"""Kinds of files as `simtest schema` names them."""
+"""Kinds of files as `simtest schema` names them, and scenes of the published protocol."""
 
 OPENING = """---
 orphan: true
@@ -23,9 +26,9 @@ orphan: true
 
 # Keys of the files
 
-Every key of every kind of file, with its type, range and default; `simtest schema KIND` prints the same as JSON. A key
-that is not listed here is refused. On the command line, `--set surface.radius_mm=5` sets the key `radius_mm` of the
-table `surface`. A key without a default must be given.
+Every key of every kind of file, with its type, range and default; `simtest schema KIND` prints the same as JSON,
+except for `published`. A key that is not listed here is refused. On the command line, `--set surface.radius_mm=5` sets
+the key `radius_mm` of the table `surface`. A key without a default must be given.
 
 """
 

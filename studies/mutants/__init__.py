@@ -1,1 +1,1 @@
-"""Planted faults and the tests that catch them: `python -m studies.mutants --tests` (docs/gallery/gate_measured.md)."""
+"""Planted faults and the tests that catch them: `python -m studies.mutants --tests` (docs/measured/gate.md)."""

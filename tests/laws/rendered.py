@@ -29,7 +29,7 @@ ESTIMATORS = ("cone_axis", "brightest_point", "curved", "photometric")
 """Those with next to no noise-free error; not circle_pose: under a light at the camera it is at its branch point."""
 
 ERROR_DEG = {"plane": 0.03, "cylinder": 0.03}
-"""Bound of each estimator's noise-free error, by pixels, smoothing, interpolation (docs/gallery/gate_measured.md)."""
+"""Bound of each estimator's noise-free error, by pixels, smoothing, interpolation (docs/measured/gate.md)."""
 
 
 TOLD_DEG = 0.005

@@ -29,7 +29,7 @@ FEW = 5
 """Answers of a cell, at least, of which not all may have the same axis ratio."""
 
 MOTION_RATE = 0.04
-"""Chance that one of the two signs that motion tells of a highlight is wrong, at most: 2 % each (docs/howto/motion.md).
+"""Chance that one of the two signs that motion tells of a highlight is wrong, at most: 2 % each (docs/howto/pictures.md).
 """
 
 ALPHA = 1e-4

@@ -99,7 +99,7 @@ def shipped(kind):
     return sorted(file.stem for file in (ROOT / "scenes" / kind).glob("*.toml"))
 
 
-@pytest.mark.parametrize(("command", "kind", "page"), [("validate", "experiments", "reference/experiments.md"),
+@pytest.mark.parametrize(("command", "kind", "page"), [("validate", "experiments", "howto/experiments.md"),
                                                        ("dataset", "datasets", "howto/datasets.md")])  # fmt: skip
 def test_help_and_pages_name_all_that_is_shipped(here, command, kind, page):
     code, output, _ = here(command, "--help")

@@ -46,7 +46,7 @@ def test_the_command_runs_as_a_user():
 
 def test_the_manual_mounts_the_folder_that_the_command_works_in():
     (folder,) = [value for name, value in instructions() if name == "WORKDIR" and value != "/src"]
-    for file in (FILE, ROOT / "docs/reference/stable.md"):
+    for file in (FILE, ROOT / "docs/reference/limits.md"):
         assert re.findall(r'-v "\$PWD:([^"]+)"', file.read_text(encoding="utf-8")) == [folder]
 
 

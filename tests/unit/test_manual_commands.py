@@ -338,6 +338,20 @@ def test_tables_of_a_page_are_made_by_their_commands(tmp_path, capsys):
     assert "broken" in capsys.readouterr().out
 
 
+def test_numbers_that_differ_are_written_on_request(tmp_path, capsys):
+    page, row = tmp_path / "page.md", "-0.5 1,040 0.123 98"
+    page.write_text(FIGURES.format(row=row, options=""), encoding="utf-8")
+    assert check_figures([page], False, 60, write=True) == 1
+    assert "0.017 is 0.123" in capsys.readouterr().out
+    assert "\n| -0.5 | 1,040 | 0.123 (98 %) |\n\nAfter.\n" in page.read_text(encoding="utf-8")
+    assert check_figures([page], False, 60, write=True) == 0
+    # What does not say which numbers it leaves out, or is not printed, stays.
+    for text in (FIGURES.format(row=row + " 7 7", options="; part"), FIGURES.format(row="0.5 1 1 1", options="")):
+        page.write_text(text, encoding="utf-8")
+        assert check_figures([page], False, 60, write=True) == 1
+        assert page.read_text(encoding="utf-8") == text
+
+
 def test_a_comment_without_a_table_is_named(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("\n<!-- made by: true; minutes: 1 -->\nno table\n", encoding="utf-8")

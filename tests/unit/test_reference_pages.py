@@ -16,9 +16,9 @@ from simtest.estimators.protocol import Estimate
 from simtest.estimators.small_spots import UNRESOLVED
 from simtest.reconstruction.explanations import FLAGS
 from simtest.runtime.files import DEFAULTS
-from simtest.spec import Scene
 from simtest.validation.columns import SCHEMA
 from simtest.validation.statistics import Figures
+from studies.manual.files_page import files_page
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ROOT / "docs/reference"
@@ -93,17 +93,7 @@ def test_every_field_of_an_estimate_is_explained():
 
 @pytest.mark.parametrize("names", [SCHEMA, Figures.model_fields], ids=["columns", "figures"])
 def test_every_column_and_figure_is_explained(names):
-    assert not missing(names, page("experiments.md"))
-
-
-def keys(model):
-    schema = model.model_json_schema()
-    return {key for own in (schema, *schema["$defs"].values()) for key in own.get("properties", {})}
-
-
-def test_every_key_of_a_scene_is_explained():
-    text = page("scenes.md") + (ROOT / "docs/concepts/tissue.md").read_text(encoding="utf-8")
-    assert not [key for key in sorted(keys(Scene)) if not re.search(rf"\b{key}\b", text)]
+    assert not missing(names, files_page())
 
 
 def test_every_limit_is_listed_with_its_number():

@@ -122,7 +122,7 @@ def sensor(base):
 
 
 def own_answers(run):
-    """Return a run's own estimates as a table of answers, as docs/howto/score.md does."""
+    """Return a run's own estimates as a table of answers, as docs/howto/scoring.md does."""
     uses = pl.DataFrame(json.loads((run / "export.json").read_text())["uses"])
     rows = pl.read_parquet(run / "results.parquet").filter(pl.col("specularity").is_not_null())
     named = rows.join(uses.select("frame", "setting", "realisation"), on=["setting", "realisation"])

@@ -2,5 +2,5 @@
 
 mirrors says where a mirror shows a light, and back. bundle fits light positions to highlights, with the errors of the
 mirrors. search finds how many lights there are and which highlight is whose. result states intervals and doubts.
-docs/howto/calibrate_the_light.md describes the measurement.
+docs/howto/cameras.md describes the measurement.
 """

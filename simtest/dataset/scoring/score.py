@@ -59,7 +59,7 @@ def score_table(
     Parameters
     ----------
     table : Path
-        CSV or Parquet (docs/howto/score.md).
+        CSV or Parquet (docs/howto/scoring.md).
     on : Path
         Folder of the run or dataset, which has an export.json.
     out : Path
