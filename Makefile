@@ -116,8 +116,9 @@ format: $(VENV)/.tests
 # One of them trains a network, so all extras are installed, and PyTorch where its CPU build is found.
 examples: $(EXTRAS)/.extras
 	for script in examples/[0-9]*.py; do $(EXTRAS)/bin/python $$script || exit 1; done
-	for script in examples/[0-9]*.py; do \
-		name=$$(basename $$script .py); picture=$$(ls examples/output/$$name.*); \
+	cd examples && for notebook in *.ipynb; do $(abspath $(EXTRAS))/bin/python run_notebook.py $$notebook || exit 1; done
+	for example in examples/[0-9]*; do \
+		name=$$(basename $${example%.*}); picture=$$(ls examples/output/$$name.*); \
 		cp $$picture docs/images/examples/$$(echo $$name | cut -c1-2).$${picture##*.}; \
 	done
 

@@ -1,4 +1,4 @@
-"""Check the manual.
+"""Check the manual, and write what of it is made.
 
     python -m studies.manual pages                      write the generated pages into docs/
     python -m studies.manual links build/manual         dead links of the built site
@@ -9,6 +9,7 @@
     python -m studies.manual figures [PAGE...] [--cheap] [--write] [--timeout S]
                                                         make the tables anew that name their command, and compare their
                                                         numbers, or write them
+    python -m studies.manual diagrams [NAME...]         draw the diagrams into docs/images/
 
 Each exits with 1 where something is wrong, and names it.
 """
@@ -37,6 +38,7 @@ def main() -> int:
     figures.add_argument("--cheap", action="store_true", help="leave out what takes more than 20 s of processor time")
     figures.add_argument("--write", action="store_true", help="write the numbers that differ into the pages")
     figures.add_argument("--timeout", type=float, default=3600.0, help="seconds that a command may take")
+    checks.add_parser("diagrams", help="draw the diagrams").add_argument("names", nargs="*", metavar="NAME")
     return _run(parser.parse_args())
 
 
@@ -45,6 +47,11 @@ def _run(given: argparse.Namespace) -> int:
         from studies.manual.pages import write_pages
 
         print(*write_pages(ROOT / "docs"), sep="\n")
+        return 0
+    if given.check == "diagrams":
+        from studies.manual.diagrams import write_diagrams
+
+        print(*write_diagrams(ROOT / "docs/images", given.names), sep="\n")
         return 0
     pages = [page.resolve() for page in getattr(given, "pages", [])] or None
     if given.check == "commands":

@@ -1,5 +1,6 @@
 """Each example runs as a user runs it, and makes the picture that the list of examples shows."""
 
+import json
 import os
 import re
 import runpy
@@ -14,7 +15,9 @@ import pytest
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
-EXAMPLES = sorted((ROOT / "examples").glob("[0-9][0-9]_*.py"))
+EXAMPLES = sorted((ROOT / "examples").glob("[0-9][0-9]_*.*"))
+NOTEBOOKS = [each for each in EXAMPLES if each.suffix == ".ipynb"]
+SCRIPTS = [each for each in EXAMPLES if each.suffix == ".py"]
 MANUAL = ROOT / "docs" / "images" / "examples"
 LONGEST, LONGEST_TRAINING = 60, 160
 LARGEST_KB = 150
@@ -39,9 +42,17 @@ def cases(in_process):
         yield pytest.param(script, marks=marks, id=script.stem)
 
 
+def arguments(example, folder):
+    """The command line of an example: a notebook is run by its runner, which takes it whole."""
+    out = ["--out", str(folder / "made")]
+    if example in NOTEBOOKS:
+        return [str(example.with_name("run_notebook.py")), str(example), *out]
+    return [str(example), "--quick", *out]
+
+
 def in_a_process_of_its_own(script, folder):
     own = dict(os.environ) | {"PYTHONPATH": str(ROOT)}
-    command = [sys.executable, str(script), "--quick", "--out", str(folder / "made")]
+    command = [sys.executable, *arguments(script, folder)]
     done = subprocess.run(command, cwd=folder, env=own, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -53,9 +64,10 @@ def in_this_process(monkeypatch, capfd):
 
     def run(script, folder):
         monkeypatch.syspath_prepend(str(script.parent))
-        monkeypatch.setattr(sys, "argv", [str(script), "--quick", "--out", str(folder / "made")])
+        argv = arguments(script, folder)
+        monkeypatch.setattr(sys, "argv", argv)
         with plt.rc_context():
-            runpy.run_path(str(script), run_name="__main__")
+            runpy.run_path(argv[0], run_name="__main__")
         return capfd.readouterr().out
 
     monkeypatch.delitem(sys.modules, "common", raising=False)
@@ -88,16 +100,6 @@ def test_an_example_runs_as_a_user_runs_it(script, tmp_path):
     check_picture(script, tmp_path, in_a_process_of_its_own(script, tmp_path))
 
 
-def test_a_picture_without_a_highlight_ends_in_one_line(tmp_path):
-    Image.fromarray(np.full((60, 80, 3), 40, np.uint8)).save(tmp_path / "dark.png")
-    (script,) = (script for script in EXAMPLES if script.name.startswith("07_"))
-    command = [sys.executable, str(script), str(tmp_path / "dark.png"), "--out", str(tmp_path / "made")]
-    own = dict(os.environ) | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=tmp_path, env=own, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 1
-    assert done.stderr == f"{tmp_path / 'dark.png'}: no highlight with a normal: none found\n"
-
-
 def test_a_training_without_its_packages_ends_in_one_line(tmp_path):
     (script,) = (script for script in EXAMPLES if "_train_" in script.name)
     # A module that cannot be found stands for a package that is not installed.
@@ -114,8 +116,8 @@ def test_a_training_without_its_packages_ends_in_one_line(tmp_path):
 def test_examples_are_short_numbered_and_listed():
     listed = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
     assert [script.name[:2] for script in EXAMPLES] == [f"{n:02}" for n in range(1, len(EXAMPLES) + 1)]
-    assert re.findall(r"\]\(([0-9][^)]*\.py)\)", listed) == [script.name for script in EXAMPLES]
-    for script in EXAMPLES:
+    assert re.findall(r"\]\(([0-9][^)]*\.(?:py|ipynb))\)", listed) == [example.name for example in EXAMPLES]
+    for script in SCRIPTS:
         text = script.read_text(encoding="utf-8")
         longest = LONGEST_TRAINING if "_train_" in script.name else LONGEST
         assert len(text.splitlines()) <= longest, script.name
@@ -123,11 +125,33 @@ def test_examples_are_short_numbered_and_listed():
         assert re.search(r"Takes\s+\d+ s\s+of\s+processor\s+time\.", text), script.name
 
 
+def code_of(example):
+    text = example.read_text(encoding="utf-8")
+    if example in SCRIPTS:
+        return text
+    cells = json.loads(text)["cells"]
+    return "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+
+
 def test_examples_use_public_names_alone():
-    for script in EXAMPLES:
-        text = script.read_text(encoding="utf-8")
-        modules = set(re.findall(r"^\s*(?:from|import) (simtest[\w.]*)", text, re.MULTILINE))
-        assert modules <= {"simtest", "simtest.dataset", "simtest.dataset.learn"}, script.name
+    for example in EXAMPLES:
+        modules = set(re.findall(r"^\s*(?:from|import) (simtest[\w.]*)", code_of(example), re.MULTILINE))
+        assert modules <= {"simtest", "simtest.dataset", "simtest.dataset.learn"}, example.name
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda notebook: notebook.stem)
+def test_notebooks_are_whole_and_without_outputs(notebook):
+    held = json.loads(notebook.read_text(encoding="utf-8"))
+    assert (held["nbformat"], held["nbformat_minor"]) == (4, 5)
+    cells = held["cells"]
+    assert len({cell["id"] for cell in cells}) == len(cells)
+    for cell in cells:
+        code = {"execution_count", "outputs"} if cell["cell_type"] == "code" else set()
+        assert set(cell) == {"cell_type", "id", "metadata", "source"} | code
+        assert not cell.get("outputs")
+        assert cell.get("execution_count") is None
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)", "".join("".join(cell["source"]) for cell in cells)):
+        assert (notebook.parent / target).exists(), target
 
 
 def test_pictures_of_the_manual_are_small():

@@ -5,6 +5,7 @@ import itertools
 import json
 import re
 import tomllib
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from studies.manual import tables
 from studies.manual.api_page import SECTIONS, api_page, entries
 from studies.manual.blocks import ROOT, manual_pages
 from studies.manual.commands_page import command, commands, commands_page, shipped_page
+from studies.manual.diagrams import SHEETS, WIDTH, write_diagrams
 from studies.manual.files_page import files_page
 from studies.manual.keys_page import MODELS, keys_page
 from studies.manual.links import dead_links
@@ -228,3 +230,28 @@ def test_dead_links_in_markdown_are_found(tmp_path):
         "page.md: #q: no such anchor",
         "page.md: no.png: no such file",
     ]
+
+
+@pytest.mark.parametrize("name", SHEETS)
+def test_a_diagram_is_small_and_its_text_stands_inside(name):
+    text = (DOCS / f"images/{name}.svg").read_text(encoding="utf-8")
+    assert len(text.encode()) < 60_000
+    for line in ElementTree.fromstring(text).iter("{http://www.w3.org/2000/svg}text"):
+        if line.get("transform") is None:
+            # The letters of a wide font are half as wide as its size, on average over a line.
+            width, x = 0.53 * float(line.get("font-size")) * len(line.text), float(line.get("x"))
+            left = x - width * {"start": 0, "middle": 0.5, "end": 1}[line.get("text-anchor")]
+            assert 0 < left < left + width < WIDTH, line.text
+            assert float(line.get("y")) < SHEETS[name]["height"], line.text
+
+
+def test_diagrams_are_those_of_the_script(tmp_path):
+    # The others render, or depend on the last digits of an isophote, or on every import.
+    for path in write_diagrams(tmp_path, ["geometry", "detection", "flow", "gate", "which_method"]):
+        assert path.read_text() == (DOCS / "images" / path.name).read_text(), "python -m studies.manual diagrams"
+
+
+def test_every_package_stands_in_the_map_of_layers(tmp_path):
+    (path,) = write_diagrams(tmp_path, ["layers"])
+    packages = {file.parent.name for file in (ROOT / "simtest").glob("*/__init__.py")} - {"__pycache__"}
+    assert packages <= set(re.findall(r">(\w+)</text>", path.read_text()))
