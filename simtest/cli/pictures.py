@@ -71,6 +71,8 @@ def reconstruct(
 ) -> Told:
     """Reconstruct the normals at the specularities of a picture, of each picture of a folder, or of a video's frames.
 
+    Exit 1 if a picture or frame was skipped.
+
     Parameters
     ----------
     image : Path
@@ -100,11 +102,16 @@ def _sequence(source: Path, out: Path, options: "Options") -> Told:
 
     with progress_bar("writing the tables") as progress:
         made = reconstruct_sequence(source, out, options, progress)
-    unread = f", {made.failed} unreadable" if made.failed else ""
+    skipped = f", {made.failed} skipped" if made.failed else ""
+    skipped += f" ({made.not_named} not named by --poses)" if made.not_named else ""
     found = counted(made.specularities, "specularity", "specularities")
-    lines = [f"{counted(made.frames, 'frame')}{unread}: {found}, {made.tracks} seen in several frames"]
+    lines = [f"{counted(made.frames, 'frame')}{skipped}: {found}, {made.tracks} seen in several frames"]
+    if len(made.sizes) > 1:
+        sizes = ", ".join(f"{size} px ({counted(count, 'frame')})" for size, count in made.sizes.items())
+        each = f"each size has a camera of {options.fov_deg:g} deg across its {options.fov_of}"
+        lines.append(f"note: {sizes}: {each}; what is assumed in px is that of the last one")
     parts = (*assumed_lines(made.assumed), *lines, *([made.motion] if made.motion else []))
-    return Told(made.files, asdict(made), parts)
+    return Told(made.files, asdict(made), parts, 1 if made.failed > made.not_named else 0)
 
 
 def _record_parts(spots: "Specularities", image: Path) -> "Iterator[str | Table]":
