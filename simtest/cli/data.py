@@ -185,7 +185,8 @@ def realism(
     out: Out,
     count: Annotated[int, whole("Generated frames that are taken or rendered, at most.")] = 40,
     surfaces: Annotated[
-        list[str] | None, flag("Take samples of this surface alone; may be repeated.", "--surface")
+        list[str] | None,
+        flag("Take samples of this surface (colon) or scene (stomach) alone; may be repeated.", "--surface"),
     ] = None,
     seed: Seed = None,
 ) -> Told:

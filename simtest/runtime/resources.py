@@ -44,6 +44,10 @@ def find(name: str | Path, kind: str, folder: str = "", suffixes: tuple[str, ...
         require_plain(path)
     names = sorted({p.stem for s in suffixes for p in root.glob(f"*{s}")})
     meant = suggestion(path.name, names)
+    if root != data_root("scenes"):
+        # A stomach is a scene, tissue_stomach, where colon and liver are meshes and experiments too.
+        scenes = sorted(p.stem for p in data_root("scenes").glob("*.toml"))
+        meant += "".join(f"; {each} is a scene" for each in scenes if path.name in (each, each.rpartition("_")[2]))
     raise InputError(f"{name or repr(name)}: no such file; shipped by name: {', '.join(names)}{meant}")
 
 

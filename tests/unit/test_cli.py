@@ -135,6 +135,7 @@ BAD_USE = {
     "dataset tiny --out made --workers 0": "workers = 0: must be 1 to 256",
     "dataset verify nowhere": "nowhere: no such folder",
     "dataset sample nowhere 0": "nowhere: no dataset to read (manifest.json: missing)",
+    "validate stomach": "sensor; tissue_stomach is a scene",
     "validate plain": "plain: no such file; shipped by name: anatomy, anatomy_sensor, camera, colon, compare",
     "validate overview --realisations many": "Invalid value for --realisations: many is not a whole number",
     **{
