@@ -11,6 +11,7 @@ from simtest.api import Extras, reconstruct_picture
 from simtest.cli.common import (
     DEFAULTS,
     MOST_ROWS,
+    OUT,
     NamedPath,
     Out,
     PictureOptions,
@@ -60,7 +61,7 @@ def reconstruct(
     image: NamedPath,
     /,
     *,
-    out: Annotated[Path | None, path("Folder for the results; default reports/normals/IMAGE.")] = None,
+    out: Annotated[Path | None, path("Folder for the results; default reports/normals/IMAGE.", OUT)] = None,
     known: PictureOptions = DEFAULTS,
     roi: Annotated[str | None, about("Region of interest x,y,w,h in px; default: detected.")] = None,
     extras: Annotated[Extras, Parameter(name="*")] = NO_EXTRAS,
@@ -443,7 +444,7 @@ def convert(
     file: Path,
     /,
     *,
-    out: Annotated[Path, path("File to write; replaced if it exists.")],
+    out: Annotated[Path, path("File to write; replaced if it exists.", OUT)],
     to: Annotated[
         Literal["toml", "opencv", "ros", "colmap", "transforms", "matlab"] | None,
         about("Format; default by the suffix of --out."),

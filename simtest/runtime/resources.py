@@ -12,6 +12,7 @@ from typing import Any
 from simtest.errors import InputError
 from simtest.runtime.boundary import suggestion
 from simtest.runtime.files import as_path, require_plain
+from simtest.runtime.messages import LOGGER
 from simtest.runtime.provenance import file_hash
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -39,6 +40,7 @@ def find(name: str | Path, kind: str, folder: str = "", suffixes: tuple[str, ...
     if path.name == str(name):
         for suffix in suffixes:
             if (shipped := root / f"{path.name}{suffix}").is_file():
+                LOGGER.debug("%s is %s", name, shipped)
                 return shipped
     if path.exists():
         require_plain(path)

@@ -10,7 +10,7 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel
 
@@ -61,8 +61,8 @@ def replace_values(
 
 def _warn_of_crop(before: Any, after: Any, settings: Mapping[str, Any], where: str) -> None:
     """Warn where a setting of the picture's size alone changes the field of view, since the table states fx."""
-    across = next((name for name in ("width", "height") if f"camera.{name}" in settings), None)
-    if across is None or {"camera", "camera.fx", "camera.fy", "camera.fov_deg"} & settings.keys():
+    across: Literal["width", "height"] = "width" if "camera.width" in settings else "height"
+    if f"camera.{across}" not in settings or {"camera", "camera.fx", "camera.fy", "camera.fov_deg"} & settings.keys():
         return
     if not isinstance(before, Mapping) or "fx" not in before:
         return
