@@ -142,7 +142,7 @@ def record_tables(spots: "Specularities") -> "Iterator[str | Table]":
         yield f"--verbose prints a row for each of the {len(spots)}; normals.csv and index.html hold them"
     elif spots:
         columns = ("no.", "x (px)", "y (px)", "kind", "score", "best", "normal", "± deg", "choice", "flags")
-        yield Table(columns, [_cells(spot) for spot in spots])
+        yield Table(columns, [_cells(spot, spots.sightline_rule) for spot in spots])
     if (compared := spots.reference) is not None:
         yield from (f"reference: {problem}" for problem in compared.problems)
         rows = [
@@ -228,13 +228,15 @@ def _pair(mean: float, spread: float | None) -> str:
     return fixed(mean) if spread is None else f"{mean:.2f} ± {spread:.2f}"
 
 
-def _cells(spot: "Specularity") -> list[str]:
+def _cells(spot: "Specularity", rule: "Sequence[str]") -> list[str]:
     from simtest.reconstruction.explanations import kind_name
+    from simtest.reconstruction.records import SIGHTLINE_RULE
 
     best, published = spot.best_estimate, spot.normals.get("circle_pose")
     x, y = (math.nan, math.nan) if spot.peak_px is None else spot.peak_px
     return [
-        str(spot.id), fixed(x, 1), fixed(y, 1), kind_name(spot.kind), fixed(spot.score), spot.best or "none",
+        str(spot.id), fixed(x, 1), fixed(y, 1), kind_name(spot.kind), fixed(spot.score),
+        SIGHTLINE_RULE if spot.best in rule else spot.best or "none",
         " ".join(f"{v:+.3f}" for v in best.normal) if best else "", fixed(best.deviation_deg if best else None),
         fixed(published.choice_margin if published else None, 1), ", ".join(best.flags) if best else "",
     ]  # fmt: skip
