@@ -9,8 +9,8 @@ APP = App(
     help="Simulation testbed for 3D reconstruction from specular highlights in endoscopy.",
     # Plain, since the modules that lay out Markdown take longer to load than all the rest.
     help_format="plaintext",
-    help_epilogue="Every command takes --quiet (neither progress nor warnings), --verbose (every step, every row) and "
-    "--traceback.",
+    help_epilogue="Every command takes --quiet, -q (neither progress nor warnings nor notes), --verbose, -v (every "
+    "step, every row, debug messages) and --traceback.",
     version_flags=["--version"],
     version=lambda: _version(),
     # `main` reports what is kept.

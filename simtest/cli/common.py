@@ -55,22 +55,28 @@ def named_path(_: Any, tokens: Sequence[Token]) -> Path:
     return Path(tokens[0].value)
 
 
-def about(text: str, name: str | None = None) -> Parameter:
+Names = str | tuple[str, ...] | None
+"""Of an option, where they are not the argument's."""
+
+OUT = ("--out", "-o")
+
+
+def about(text: str, name: Names = None) -> Parameter:
     """Return an option with its line of help, and its name where that is not the argument's."""
     return Parameter(name=name, help=text)
 
 
-def whole(text: str, name: str | None = None) -> Parameter:
+def whole(text: str, name: Names = None) -> Parameter:
     """Return the option for a whole number."""
     return Parameter(name=name, help=text, converter=whole_number)
 
 
-def path(text: str, name: str | None = None) -> Parameter:
+def path(text: str, name: Names = None) -> Parameter:
     """Return the option for a file or folder that must have a name."""
     return Parameter(name=name, help=text, converter=named_path)
 
 
-def flag(text: str, name: str | None = None) -> Parameter:
+def flag(text: str, name: Names = None) -> Parameter:
     """Return the option that takes no value, and has no opposite."""
     return Parameter(name=name, help=text, negative="")
 
@@ -151,8 +157,8 @@ Estimators = Annotated[
         "'command: PROGRAM ARGUMENT...' or FILE.toml; may be repeated.",
     ),
 ]
-Out = Annotated[Path, path("Folder for the results; made if need be.")]
-Realisations = Annotated[int | None, whole("Realisations of each setting.")]
+Out = Annotated[Path, path("Folder for the results; made if need be.", OUT)]
+Realisations = Annotated[int | None, whole("Realisations of each setting.", ("--realisations", "-n"))]
 Views = Annotated[int | None, whole("Viewpoints of each group that varies them, the first ones; default all.")]
 Seed = Annotated[int | None, Parameter(help="Seed of the run.", converter=seed_number)]
 EngineName = Annotated[Literal["local", "ray"], about("Local processes, or a Ray cluster.", "--engine")]
@@ -336,6 +342,8 @@ class Told:
                 print_json(data)
             return
         for part in (*self.parts, *self.files):
+            if MANNERS.quiet and str(part).startswith("note: "):
+                continue
             if isinstance(part, Table):
                 part.print()
             elif callable(part):

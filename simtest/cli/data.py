@@ -9,6 +9,7 @@ from cyclopts import App, Parameter, Token
 
 from simtest.cli.common import (
     ONE_PROCESS,
+    OUT,
     AsJson,
     EngineOptions,
     Out,
@@ -55,8 +56,8 @@ def make(
     described: Annotated[str, named("datasets", files=True, name="DATASET")],
     /,
     *,
-    out: Annotated[Path, path("Folder of the dataset; made if need be.")],
-    samples: Annotated[int | None, whole("Number of samples; default the file's.")] = None,
+    out: Annotated[Path, path("Folder of the dataset; made if need be.", OUT)],
+    samples: Annotated[int | None, whole("Number of samples; default the file's.", ("--samples", "-n"))] = None,
     seed: Seed = None,
     settings: Settings = None,
     engine: EngineOptions = ONE_PROCESS,
@@ -121,7 +122,7 @@ def sample(
     index: Annotated[int, Parameter(converter=whole_number)],
     /,
     *,
-    out: Annotated[Path | None, path("Folder for the files; default sample-INDEX.")] = None,
+    out: Annotated[Path | None, path("Folder for the files; default sample-INDEX.", OUT)] = None,
     variant: Annotated[str | None, about("Mitsuba variant; default the dataset's own.")] = None,
 ) -> Told:
     """Make one sample of a dataset again, alone; exit 1 if it differs from the stored one.
@@ -147,8 +148,8 @@ def preview(
     folder: Folder,
     /,
     *,
-    out: Annotated[Path | None, path("Page to write; default preview.html in the current folder.")] = None,
-    samples: Annotated[int, whole("How many samples to show.")] = 24,
+    out: Annotated[Path | None, path("Page to write; default preview.html in the current folder.", OUT)] = None,
+    samples: Annotated[int, whole("How many samples to show.", ("--samples", "-n"))] = 24,
 ) -> Told:
     """Write a page with a dataset's frames, labels, highlights and distributions."""
     from simtest.dataset.card import write_preview
@@ -164,7 +165,7 @@ def export(
     folder: Folder,
     /,
     *,
-    out: Annotated[Path, path("Folder for the frames; made if need be.")],
+    out: Annotated[Path, path("Folder for the frames; made if need be.", OUT)],
     engine: EngineOptions = ONE_PROCESS,
 ) -> Told:
     """Export a dataset's frames without their truth, for methods that run elsewhere; `simtest score` takes answers."""
@@ -183,9 +184,10 @@ def realism(
     *,
     against: Annotated[str, about("Generated frames: a dataset's folder, a folder of pictures, or a scene.")],
     out: Out,
-    count: Annotated[int, whole("Generated frames that are taken or rendered, at most.")] = 40,
+    count: Annotated[int, whole("Generated frames that are taken or rendered, at most.", ("--count", "-n"))] = 40,
     surfaces: Annotated[
-        list[str] | None, flag("Take samples of this surface alone; may be repeated.", "--surface")
+        list[str] | None,
+        flag("Take samples of this surface (colon) or scene (stomach) alone; may be repeated.", "--surface"),
     ] = None,
     seed: Seed = None,
 ) -> Told:
@@ -233,7 +235,7 @@ def fit(
     /,
     *,
     recipe: Annotated[str, about("A dataset file, or the name of a shipped one, whose ranges are fitted.")],
-    out: Annotated[Path, path("TOML file for the fitted recipe; the report stands beside it.")],
+    out: Annotated[Path, path("TOML file for the fitted recipe; the report stands beside it.", OUT)],
     scene: Annotated[
         str | None, about("Base scene of the family that is fitted; needed where there are several.")
     ] = None,

@@ -7,7 +7,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
@@ -74,15 +75,17 @@ def _importing(frame: FrameType | None) -> bool:
 FLAGS = ("--quiet", "--verbose", "--traceback")
 """What every command takes; `simtest --help` names them."""
 
+SHORT = {"-q": "--quiet", "-v": "--verbose"}
+
 
 class Manners:
     """How much is said; of this process."""
 
     quiet = False
-    """Neither progress nor warnings: results and errors alone."""
+    """Neither progress nor warnings nor notes: results and errors alone."""
 
     verbose = False
-    """Every step of the work and every row of a table."""
+    """Every step of the work, every row of a table, and the debug messages of the logger "simtest"."""
 
 
 MANNERS = Manners()
@@ -92,6 +95,7 @@ def take_flags(words: Sequence[str]) -> tuple[list[str], bool]:
     """Set `MANNERS` by the flags of a command line; return its other words, and whether it has ``--traceback``."""
     # Behind -- nothing is a flag.
     end = list(words).index("--") if "--" in words else len(words)
+    words = [*(SHORT.get(word, word) for word in words[:end]), *words[end:]]
     flags = set(words[:end]).intersection(FLAGS)
     MANNERS.quiet, MANNERS.verbose = "--quiet" in flags, "--verbose" in flags
     return [word for i, word in enumerate(words) if i >= end or word not in FLAGS], "--traceback" in flags
@@ -139,8 +143,12 @@ def _run() -> int:
     """Run the command and return its exit code."""
     sys.argv[1:], wants_traceback = take_flags(sys.argv[1:])
     failed = BAD_USE if sys.argv[1:2] == ["nightly"] else 1
-    _answer_warnings(MANNERS.quiet, wants_traceback)
+    with _messages(wants_traceback):
+        return _answer(failed, wants_traceback)
 
+
+def _answer(failed: int, wants_traceback: bool) -> int:
+    """Run the command and return its exit code; `failed` is that of an error that is none of the input."""
     from cyclopts import CycloptsError, MissingArgumentError, UnknownOptionError
 
     from simtest.cli.commands import APP, GONE
@@ -226,20 +234,31 @@ def _code(result: object) -> int:
     return result if isinstance(result, int) else 0
 
 
-def _answer_warnings(quiet: bool, plain: bool) -> None:
-    """Have warnings printed in one line, or not at all where `quiet`, or as Python does where `plain`."""
+@contextmanager
+def _messages(plain: bool) -> Iterator[None]:
+    """Print warnings and messages of the logger "simtest" in one line each, but warnings as Python does if `plain`."""
+    import logging
     import warnings
 
-    if quiet:
-        warnings.showwarning = lambda *_, **__: None
-    elif not plain:
-        warnings.showwarning = _warn
+    from simtest.runtime.messages import LOGGER, log_warnings
 
+    class Lines(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            from simtest.errors import one_line
 
-def _warn(message: Warning | str, *_: object, **__: object) -> None:
-    from simtest.errors import one_line
+            print(f"simtest: {record.levelname.lower()}: {one_line(record.getMessage())}", file=sys.stderr)
 
-    print(f"simtest: warning: {one_line(message)}", file=sys.stderr)
+    before, level, handler = warnings.showwarning, LOGGER.level, Lines()
+    LOGGER.addHandler(handler)
+    LOGGER.setLevel(logging.ERROR if MANNERS.quiet else logging.DEBUG if MANNERS.verbose else logging.WARNING)
+    if MANNERS.quiet or not plain:
+        log_warnings()
+    try:
+        yield
+    finally:
+        LOGGER.removeHandler(handler)
+        LOGGER.setLevel(level)
+        warnings.showwarning = before
 
 
 def _mend_terminal() -> None:

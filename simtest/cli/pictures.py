@@ -11,6 +11,7 @@ from simtest.api import Extras, reconstruct_picture
 from simtest.cli.common import (
     DEFAULTS,
     MOST_ROWS,
+    OUT,
     NamedPath,
     Out,
     PictureOptions,
@@ -60,7 +61,7 @@ def reconstruct(
     image: NamedPath,
     /,
     *,
-    out: Annotated[Path | None, path("Folder for the results; default reports/normals/IMAGE.")] = None,
+    out: Annotated[Path | None, path("Folder for the results; default reports/normals/IMAGE.", OUT)] = None,
     known: PictureOptions = DEFAULTS,
     roi: Annotated[str | None, about("Region of interest x,y,w,h in px; default: detected.")] = None,
     extras: Annotated[Extras, Parameter(name="*")] = NO_EXTRAS,
@@ -70,6 +71,8 @@ def reconstruct(
     ] = None,
 ) -> Told:
     """Reconstruct the normals at the specularities of a picture, of each picture of a folder, or of a video's frames.
+
+    Exit 1 if a picture or frame was skipped.
 
     Parameters
     ----------
@@ -100,11 +103,16 @@ def _sequence(source: Path, out: Path, options: "Options") -> Told:
 
     with progress_bar("writing the tables") as progress:
         made = reconstruct_sequence(source, out, options, progress)
-    unread = f", {made.failed} unreadable" if made.failed else ""
+    skipped = f", {made.failed} skipped" if made.failed else ""
+    skipped += f" ({made.not_named} not named by --poses)" if made.not_named else ""
     found = counted(made.specularities, "specularity", "specularities")
-    lines = [f"{counted(made.frames, 'frame')}{unread}: {found}, {made.tracks} seen in several frames"]
+    lines = [f"{counted(made.frames, 'frame')}{skipped}: {found}, {made.tracks} seen in several frames"]
+    if len(made.sizes) > 1:
+        sizes = ", ".join(f"{size} px ({counted(count, 'frame')})" for size, count in made.sizes.items())
+        each = f"each size has a camera of {options.fov_deg:g} deg across its {options.fov_of}"
+        lines.append(f"note: {sizes}: {each}; what is assumed in px is that of the last one")
     parts = (*assumed_lines(made.assumed), *lines, *([made.motion] if made.motion else []))
-    return Told(made.files, asdict(made), parts)
+    return Told(made.files, asdict(made), parts, 1 if made.failed > made.not_named else 0)
 
 
 def _record_parts(spots: "Specularities", image: Path) -> "Iterator[str | Table]":
@@ -134,7 +142,7 @@ def record_tables(spots: "Specularities") -> "Iterator[str | Table]":
         yield f"--verbose prints a row for each of the {len(spots)}; normals.csv and index.html hold them"
     elif spots:
         columns = ("no.", "x (px)", "y (px)", "kind", "score", "best", "normal", "± deg", "choice", "flags")
-        yield Table(columns, [_cells(spot) for spot in spots])
+        yield Table(columns, [_cells(spot, spots.sightline_rule) for spot in spots])
     if (compared := spots.reference) is not None:
         yield from (f"reference: {problem}" for problem in compared.problems)
         rows = [
@@ -220,13 +228,15 @@ def _pair(mean: float, spread: float | None) -> str:
     return fixed(mean) if spread is None else f"{mean:.2f} ± {spread:.2f}"
 
 
-def _cells(spot: "Specularity") -> list[str]:
+def _cells(spot: "Specularity", rule: "Sequence[str]") -> list[str]:
     from simtest.reconstruction.explanations import kind_name
+    from simtest.reconstruction.records import SIGHTLINE_RULE
 
     best, published = spot.best_estimate, spot.normals.get("circle_pose")
     x, y = (math.nan, math.nan) if spot.peak_px is None else spot.peak_px
     return [
-        str(spot.id), fixed(x, 1), fixed(y, 1), kind_name(spot.kind), fixed(spot.score), spot.best or "none",
+        str(spot.id), fixed(x, 1), fixed(y, 1), kind_name(spot.kind), fixed(spot.score),
+        SIGHTLINE_RULE if spot.best in rule else spot.best or "none",
         " ".join(f"{v:+.3f}" for v in best.normal) if best else "", fixed(best.deviation_deg if best else None),
         fixed(published.choice_margin if published else None, 1), ", ".join(best.flags) if best else "",
     ]  # fmt: skip
@@ -436,7 +446,7 @@ def convert(
     file: Path,
     /,
     *,
-    out: Annotated[Path, path("File to write; replaced if it exists.")],
+    out: Annotated[Path, path("File to write; replaced if it exists.", OUT)],
     to: Annotated[
         Literal["toml", "opencv", "ros", "colmap", "transforms", "matlab"] | None,
         about("Format; default by the suffix of --out."),

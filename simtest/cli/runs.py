@@ -11,6 +11,7 @@ from cyclopts import App, Parameter
 
 from simtest.cli.common import (
     ONE_PROCESS,
+    OUT,
     Address,
     EngineName,
     EngineOptions,
@@ -60,7 +61,7 @@ def validate(
     experiment: Annotated[str, named("experiments", files=True)],
     /,
     *,
-    out: Annotated[Path | None, path("Folder of the run; default reports/runs/EXPERIMENT.")] = None,
+    out: Annotated[Path | None, path("Folder of the run; default reports/runs/EXPERIMENT.", OUT)] = None,
     realisations: Realisations = None,
     seed: Seed = None,
     views: Views = None,
@@ -237,7 +238,7 @@ def score(
     /,
     *,
     on: Annotated[Path, path("Run or dataset whose frames were exported; it holds export.json.")],
-    out: Annotated[Path | None, path("Folder of the scored run; default reports/scores/NAME.")] = None,
+    out: Annotated[Path | None, path("Folder of the scored run; default reports/scores/NAME.", OUT)] = None,
     name: Annotated[str | None, about("Name of the method in the results; default that of the file.")] = None,
     engine: EngineOptions = ONE_PROCESS,
     how: HowMapsAreRead = NOTHING_STATED,
@@ -425,7 +426,7 @@ def table(
     folder: Path,
     /,
     *,
-    out: Annotated[Path, path("The page; or a folder, which gets index.html.")],
+    out: Annotated[Path, path("The page; or a folder, which gets index.html.", OUT)],
     suite: SuiteVersion = "v1",
 ) -> Told:
     """Make a page that ranks the certificates below a folder.

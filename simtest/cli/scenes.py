@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from cyclopts import App, Parameter
 
 from simtest.cli.common import (
+    OUT,
     AsJson,
     Out,
     SceneName,
@@ -37,7 +38,7 @@ def render(
     scene: SceneName,
     /,
     *,
-    out: Annotated[Path | None, path("Folder for the results; default reports/frames/SCENE.")] = None,
+    out: Annotated[Path | None, path("Folder for the results; default reports/frames/SCENE.", OUT)] = None,
     settings: Settings = None,
     variant: Variant = None,
 ) -> Told:
@@ -62,7 +63,7 @@ def views(
     /,
     *,
     out: Out,
-    count: Annotated[int, whole("Views wanted, 1 to 1000.")] = 50,
+    count: Annotated[int, whole("Views wanted, 1 to 1000.", ("--count", "-n"))] = 50,
     along: Annotated[
         str | None,
         Parameter(
@@ -293,7 +294,7 @@ def check(
 class Recipe:
     """The options of an anatomy: its recipe, and where its mesh goes."""
 
-    out: Annotated[Path, path("File to write: .ply, .obj or .stl.")]
+    out: Annotated[Path, path("File to write: .ply, .obj or .stl.", OUT)]
     seed: Seed = None
     edge_mm: Annotated[float | None, about("Edge length, mm; default that of the scenes.")] = None
     recipe: Annotated[Path | None, path("Recipe file (TOML); default the shipped one.")] = None

@@ -4,11 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from simtest.dataset.reader import read_samples, shard_names
+from simtest.dataset.reader import open_manifest, read_samples, shard_names
 from simtest.errors import InputError
 from simtest.reconstruction.images import Source, is_sequence, open_source, read_picture
 from simtest.runtime.arrays import Image, only_reading
@@ -92,9 +92,9 @@ def open_generated(against: str, count: int, surfaces: Sequence[str] = ()) -> li
     """Open the generated side: a dataset's folder, a folder or film of frames, or a scene to be rendered.
 
     Of a dataset at most `count` samples are taken, of as many anatomies as possible; its anatomies are the scenes. Of a
-    folder's pictures `count` are taken, evenly spread. `surfaces` names those that are taken of a dataset, by default
-    all. A scene is rendered `count` times, from another viewpoint and with another seed of relief, pattern and noise
-    each time; each frame counts as a scene.
+    folder's pictures `count` are taken, evenly spread. `surfaces` names those that are taken of a dataset, by kind of
+    surface (colon) or by base scene (tissue_stomach, or stomach), by default all. A scene is rendered `count` times,
+    from another viewpoint and with another seed of relief, pattern and noise each time; each frame counts as a scene.
     """
     check_count(count, "--count", MOST_GENERATED)
     if not against.strip():
@@ -125,11 +125,17 @@ def _dataset(path: Path, count: int, surfaces: Sequence[str]) -> list[NamedFrame
     names = shard_names(path)
     index = pl.read_parquet(path / SAMPLES).filter(pl.col("shard").is_in(names))
     held = index["surface"].unique(maintain_order=True).to_list()
+    described: Any = open_manifest(path).dataset
+    scenes = [Path(family["scene"]).stem for family in described["families"]]
+    wanted = []
     for name in surfaces:
-        if name not in held:
-            raise InputError(f"--surface {name}: {path} has none; it has {', '.join(held)}")
-    if surfaces:
-        index = index.filter(pl.col("surface").is_in(list(surfaces)))
+        of_scene = [i for i, scene in enumerate(scenes) if name in (scene, scene.removeprefix("tissue_"))]
+        if name not in held and not of_scene:
+            allowed = dict.fromkeys((*held, *scenes))
+            raise InputError(f"--surface {name}: {path} has none; it has {', '.join(allowed)}")
+        wanted.append(pl.col("surface") == name if name in held else pl.col("family").is_in(of_scene))
+    if wanted:
+        index = index.filter(pl.any_horizontal(wanted))
     # The first sample of each anatomy, then the second of each, ...: neighbours show one anatomy.
     turn = pl.int_range(pl.len()).over("family", "anatomy")
     taken = index.sort("index").sort(turn, maintain_order=True).head(count).sort("index")

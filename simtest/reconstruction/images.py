@@ -107,6 +107,19 @@ def _check_header(path: Path) -> None:
         warnings.warn(f"{path}: holds several pictures; the first is used", stacklevel=4)
 
 
+def header_size(path: Path) -> tuple[int, int] | None:
+    """Return width and height by a picture's header, as it will be read; None where Pillow does not know the file."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with PillowImage.open(path) as header:
+                is_on_its_side = header.format == "TIFF" and header.getexif().get(ORIENTATION, 1) > 4
+                return header.size[::-1] if is_on_its_side else header.size
+    except Exception:
+        # Whoever reads the picture says what is wrong with it.
+        return None
+
+
 def _tiff_size(path: Path) -> tuple[int, int, int]:
     """Return width, height and bits a pixel of a TIFF file that Pillow does not know; zeros where it is none."""
     from PIL import TiffImagePlugin

@@ -23,7 +23,7 @@ from simtest.reconstruction import explanations
 from simtest.reconstruction.assumptions import light_note
 from simtest.reconstruction.explanations import kind_name
 from simtest.reconstruction.overlay import draw_overlay
-from simtest.reconstruction.records import Points, Specularities, Specularity, cloud_members
+from simtest.reconstruction.records import SIGHTLINE_RULE, Points, Specularities, Specularity, cloud_members
 from simtest.reconstruction.tracking import DoneFrame, Track
 from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Image
@@ -44,10 +44,11 @@ HALF = 0.5
 
 def write_picture_page(path: Path, spots: Specularities, picture: Image) -> None:
     """Write the page of a picture in [0, 1], RGB as encoded: its highlights one by one, to zoom and click."""
-    palette = colours(name for spot in spots for name in spot.estimates)
-    belongs = cloud_members(spots)
+    belongs, rule = cloud_members(spots), spots.sightline_rule
+    drawn = [_spot(spot, belongs.get(spot.id), rule) for spot in spots]
+    palette = colours(row["name"] for spot in drawn for row in spot["rows"])
     data = {
-        "spots": [_spot(spot, belongs.get(spot.id)) for spot in spots],
+        "spots": drawn,
         "others": [
             {"kind": explanations.kind_name(h.kind), "outline": _rounded(h.outline, 1),
              "peak": np.add(h.region.peak, 0.5).tolist(), "score": h.score, "id": number}
@@ -61,12 +62,12 @@ def write_picture_page(path: Path, spots: Specularities, picture: Image) -> None
         | {"kinds": {explanations.kind_name(kind): text for kind, text in explanations.KINDS.items()}},
     }  # fmt: skip
     height, width = picture.shape[:2]
-    best, stated = Counter(spot.best for spot in spots if spot.best), spots.stated
+    best, stated = Counter(spot["best"] for spot in drawn if spot["best"]), spots.stated
     parts = {} if stated is None else stated.shown_parts_deg
     clouds = bool(spots.clouds)
     write_page(
         path, "picture.html.j2", data, record=spots, stated=stated, organ=spots.stated_of_organ,
-        of_organ=spots.of_organ, rule=spots.sightline_rule, rule_note=spots.rule_note,
+        of_organ=spots.of_organ, rule_note=spots.rule_note,
         told=list(parts.items()), picture=_address(picture),
         title=Path(spots.image).name, width=width, height=height, palette=palette, best=best,
         answered=sum(best.values()), clouds=clouds, terms=explanations.TERMS,
@@ -112,16 +113,22 @@ def _index(line: Points, kept: list[Points]) -> int:
     return kept.index(rounded)
 
 
-def _spot(spot: Specularity, cloud_id: int | None) -> JsonObject:
+def _spot(spot: Specularity, cloud_id: int | None, rule: Sequence[str]) -> JsonObject:
+    """Describe a specularity; the estimators that are one rule have one row, that of the best one which answered."""
     lines: list[Points] = []
-    rows = [{"name": name, **_row(name, result, spot, lines)} for name, result in spot.estimates.items()]
+    of_rule = [name for name in (spot.best, *spot.normals, *spot.estimates) if name in rule][:1]
+    rows = [
+        {"name": SIGHTLINE_RULE if name in rule else name, **_row(name, result, spot, lines)}
+        for name, result in spot.estimates.items()
+        if name not in rule or name in of_rule
+    ]
     return {
         "id": spot.id,
         "peak": _rounded(spot.position_px, 2),
         "size": max(spot.region.box[2:]),
         "kind": explanations.kind_name(spot.kind),
         "score": spot.score,
-        "best": spot.best,
+        "best": SIGHTLINE_RULE if spot.best in rule else spot.best,
         "because": spot.best_because,
         "cloud": cloud_id,
         "lines": lines,
@@ -186,7 +193,7 @@ def specularities_html(spots: Specularities) -> str:
     drawn = cv2.cvtColor(draw_overlay(picture, spots), cv2.COLOR_BGR2RGB)
     more = f"{spots.counted}; the best normal of each is drawn"
     more += f", the brightest {MOST_ROWS} are listed." if len(spots) > MOST_ROWS else "."
-    rows = [_best_cells(spot) for spot in spots[:MOST_ROWS]]
+    rows = [_best_cells(spot, spots.sightline_rule) for spot in spots[:MOST_ROWS]]
     return picture_html(drawn, more) + note_html(more) + table_html(("No.", "kind", "best estimator", *HEADS), rows)
 
 
@@ -212,12 +219,12 @@ def _picture(values: Image, encoding: str) -> Image:
     return displayed(scaled / max(float(scaled.max()), 1e-12))
 
 
-def _best_cells(spot: Specularity) -> tuple[object, ...]:
+def _best_cells(spot: Specularity, rule: Sequence[str]) -> tuple[object, ...]:
     best = spot.best_estimate
     kind = kind_name(spot.kind) or ("cloud" if best is not None and best.cloud is not None else "")
     if best is None:
         return (spot.id, kind, "no normal", "", "", "", spot.best_because)
-    return (spot.id, kind, spot.best, *_cells("", best)[1:])
+    return (spot.id, kind, SIGHTLINE_RULE if spot.best in rule else spot.best, *_cells("", best)[1:])
 
 
 def _cells(name: str, result: Estimate | Failure) -> tuple[object, ...]:

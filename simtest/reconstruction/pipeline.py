@@ -29,6 +29,7 @@ from simtest.reconstruction.options import CLOUD, SMOOTHING_BY_COLOUR_PX, Option
 from simtest.reconstruction.records import Specularities, Specularity
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.boundary import plain_errors
+from simtest.runtime.messages import LOGGER
 
 LEAST_HEIGHT = 6.0
 """A user's region holds a highlight if its peak is so many standard deviations of the smoothed noise above its median:
@@ -157,6 +158,7 @@ def reconstruct_values(
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
     spots = run(picture, calibration, options)
+    LOGGER.debug("%s: %s, %d other highlights; %s", name, spots.counted, len(spots.detection.others), spots.choices)
     spots.image = name
     # Any other extent is that of the whole picture, borders included.
     across_all = options.fov_deg is not None and options.fov_of != "view"

@@ -12,7 +12,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -22,7 +22,7 @@ import numpy.typing as npt
 from simtest.calibration import Calibration
 from simtest.errors import InputError
 from simtest.reconstruction.assumptions import Assumption
-from simtest.reconstruction.images import SequenceFrame, Source, open_source
+from simtest.reconstruction.images import SequenceFrame, Source, header_size, open_source
 from simtest.reconstruction.motion import COLUMNS as MOTION_COLUMNS
 from simtest.reconstruction.motion import (
     LEAST_MOTION,
@@ -51,6 +51,9 @@ from simtest.runtime.provenance import environment, version
 Progress = Callable[[int, int, str], None]
 
 SETTINGS = "run.json"
+MOST_NAMES = 3
+"""Pictures of another size than the camera's that a refusal names, of each size."""
+
 TIMELINE = ("frame", "time_s", "track", *COLUMNS)
 
 
@@ -59,7 +62,8 @@ class SequenceResult:
     """How many frames, specularities and tracks of two frames or more a sequence gave, and the files written.
 
     `assumed` is what nobody gave of its frames; empty where all were done by an earlier run. `motion` says how many
-    highlights' curvatures the poses tell, where these are known.
+    highlights' curvatures the poses tell, where these are known. `not_named` are those of the failed that the poses do
+    not name, such as a contact sheet. `sizes` counts the frames by their size, "640 x 480".
     """
 
     frames: int
@@ -69,6 +73,8 @@ class SequenceResult:
     files: list[Path]
     assumed: Sequence[Assumption] = ()
     motion: str | None = None
+    not_named: int = 0
+    sizes: Mapping[str, int] = field(default_factory=dict)
 
 
 @plain_errors
@@ -86,6 +92,9 @@ def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Prog
     calibration = stated_calibration(options)
     if options.poses is not None:
         poses, options = _checked_poses(options.poses, source, options, calibration)
+    if calibration is not None:
+        named = set(poses.names) if poses is not None and poses.names else None
+        _check_sizes([file for file in source.files if named is None or file.name in named], calibration, options)
     with exclusive_folder(out):
         return _reconstruct(source, out, options, calibration, progress, poses)
 
@@ -108,6 +117,26 @@ def _checked_poses(
         poses.of_files([file.name for file in source.files])
     names = tuple(options.estimators or default_estimators(calibration))
     return poses, replace(options, estimators=names if NEEDED in names else (*names, NEEDED))
+
+
+def _check_sizes(files: Sequence[Path], calibration: Calibration, options: Options) -> None:
+    """Raise `InputError` that names the pictures whose headers state another size than the camera's."""
+    camera, others = calibration.camera, dict[tuple[int, int], list[str]]()
+    for file in files:
+        size = header_size(file)
+        if size not in (None, (camera.width, camera.height)):
+            others.setdefault(size, []).append(file.name)
+    if not others:
+        return
+    listed, count = [], sum(map(len, others.values()))
+    for (width, height), names in others.items():
+        more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+        listed.append(f"{', '.join(names[:MOST_NAMES])}{more} ({width} x {height})")
+    raise InputError(
+        f"--camera {options.camera}: is of {camera.width} x {camera.height} px, and {count} of {len(files)} pictures "
+        f"are of another size: {'; '.join(listed)}; give a folder of one size for each camera, or --fov, which takes "
+        "each size"
+    )
 
 
 def _reconstruct(
@@ -149,7 +178,7 @@ def _reconstruct(
         progress(run.taken, run.taken, "")
     return SequenceResult(
         run.taken, run.failed, sum(frame.count for frame in run.frames), sum(len(track.frames) > 1 for track in tracks),
-        files, run.assumed, motion,
+        files, run.assumed, motion, run.not_named, run.sizes,
     )  # fmt: skip
 
 
@@ -158,15 +187,18 @@ class _Run:
 
     def __init__(self, out: Path, options: Options, settings: JsonObject, calibration: Calibration | None) -> None:
         self.out, self.folder, self.options, self.settings = out, out / "frames", options, settings
-        self._calibration, self._origin = calibration, environment()
+        self._stated, self._origin = calibration, environment()
+        # By a field of view each size has a camera of its own, and cautions about it.
+        self._known: dict[tuple[int, int], tuple[Calibration, list[str]]] = {}
+        self.sizes: Counter[str] = Counter()
         self.frames: list[DoneFrame] = []
         self.tracks: dict[int, Track] = {}
-        self.taken = self.failed = 0
+        self.taken = self.failed = self.not_named = 0
         self.first_error = ""
         self.strangers: frozenset[str] = frozenset()  # files that the poses do not name, such as a contact sheet
         self.assumed: Sequence[Assumption] = ()
         self._is_made = False  # a frame of this run; those behind it that an earlier one did have other tracks
-        self._cautions: list[str] = []
+        self._warned: set[str] = set()
         self._tracker: Tracker | None = None
 
     def take(self, frame: SequenceFrame) -> None:
@@ -175,12 +207,12 @@ class _Run:
         # done by an earlier run: only the tracks are counted anew
         done = None if self._is_made else _read_done(self.file(frame.index), frame.name)
         if done is not None:
-            if self._calibration is None:
-                # A field of view is that of the first picture, also of frames that are made in a later run.
+            if self._stated is None and tuple(done["size"]) not in self._known:
+                # A field of view is that of the first picture of a size, also of frames that are made in a later run.
                 with contextlib.suppress(InputError):
-                    self._calibration, self._cautions = calibration_for(self.options, frame.read())
+                    self._calibration_of(frame.read())
             before = deepcopy(self._tracker)
-            numbers = self._track_numbers(_positions(done), done["size"], frame.index)
+            numbers = self._track_numbers(_positions(done), tuple(done["size"]), frame.index)
             if numbers == [spot["track"] for spot in done["specularities"]]:
                 self._keep(frame.index, done, numbers)
                 return
@@ -193,10 +225,12 @@ class _Run:
             self._is_made = True
         except InputError as error:
             # The first frame shows a wrong camera or estimator; a file that is no picture is passed over.
-            refused = picture is not None and self._calibration is not None
-            if refused and not self.frames and frame.name not in self.strangers:
+            refused = picture is not None and (self._stated is not None or self._known)
+            is_stranger = frame.name in self.strangers
+            if refused and not self.frames and not is_stranger:
                 raise
             self.failed += 1
+            self.not_named += is_stranger
             self.first_error = self.first_error or str(error)
             warnings.warn(f"frame {frame.index}: {error}", stacklevel=3)
 
@@ -204,14 +238,26 @@ class _Run:
         """Return the JSON file of a frame."""
         return self.folder / f"{index:06d}.json"
 
+    def _calibration_of(self, picture: Image) -> tuple[Calibration, list[str]]:
+        """Return the calibration of pictures of this size, and cautions about it.
+
+        The first picture of a size completes a camera that is known by its field of view alone.
+        """
+        if self._stated is not None:
+            return self._stated, []
+        size = (picture.shape[1], picture.shape[0])
+        if size not in self._known:
+            self._known[size] = calibration_for(self.options, picture)
+        return self._known[size]
+
     def _reconstruct(self, frame: SequenceFrame, picture: Image) -> None:
         size = (picture.shape[1], picture.shape[0])
-        # The first picture's size completes a camera that is known by its field of view alone.
-        if self._calibration is None:
-            self._calibration, self._cautions = calibration_for(self.options, picture)
-        for caution in () if self._is_made else self._cautions:
-            warnings.warn(caution, stacklevel=6)
-        found = reconstruct_values(frame.name, picture, self._calibration, self.options, self._cautions)
+        calibration, cautions = self._calibration_of(picture)
+        for caution in cautions:
+            if caution not in self._warned:
+                warnings.warn(caution, stacklevel=6)
+        self._warned.update(cautions)
+        found = reconstruct_values(frame.name, picture, calibration, self.options, cautions)
         self.assumed = found.choices.assumed
         numbers = self._track_numbers([spot.position_px for spot in found], size, frame.index)
         found[:] = [replace(spot, track=number) for spot, number in zip(found, numbers, strict=True)]
@@ -230,6 +276,7 @@ class _Run:
     def _keep(self, index: int, entry: JsonObject, numbers: Sequence[int]) -> None:
         """Add a frame to the tracks, in plain numbers: a film has thousands, and their files hold the rest."""
         time_s, spots = entry["time_s"], entry["specularities"]
+        self.sizes["{} x {}".format(*entry["size"])] += 1
         self.frames.append(DoneFrame(index, entry["image"], time_s, len(spots)))
         for spot, number in zip(spots, numbers, strict=True):
             track = self.tracks.setdefault(number, Track(number))
@@ -241,7 +288,7 @@ class _Run:
 
     def _track_numbers(self, positions_px: Sequence[npt.ArrayLike], size: tuple[int, int], index: int) -> list[int]:
         self._tracker = self._tracker or Tracker(size)
-        return self._tracker.update(positions_px, index)
+        return self._tracker.update(positions_px, index, size)
 
 
 def _positions(entry: JsonObject) -> list[npt.ArrayLike]:

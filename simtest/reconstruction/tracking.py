@@ -56,27 +56,35 @@ class Track:
 class _Moving:
     number: int
     position: Array
+    size: tuple[int, int]
     step: Array = field(default_factory=lambda: np.zeros(2))
     unseen: int = 0
 
 
 class Tracker:
-    """Assigns the specularities of each frame, of a width and height in px, to tracks.
+    """Assigns the specularities of each frame to tracks; frames of another width and height, px, have other tracks.
 
     All are assigned together, by the least sum of distances to where tracks are expected; the rest begin new tracks.
     """
 
     def __init__(self, size: tuple[int, int]) -> None:
-        self.reach = REACH_SHARE * max(size)
+        self.size = size
         self._tracks: list[_Moving] = []
         self._count = 0
         self._next = 0
 
-    def update(self, positions_px: Sequence[npt.ArrayLike], index: int) -> list[int]:
-        """Return the track of each specularity of the next frame that was read, by their positions, px."""
+    def update(
+        self, positions_px: Sequence[npt.ArrayLike], index: int, size: tuple[int, int] | None = None
+    ) -> list[int]:
+        """Return the track of each specularity of the next frame that was read, by their positions, px.
+
+        The frame is of the tracker's size, unless another is given.
+        """
         # Imported here: slow to load, and single pictures have no tracks.
         from scipy.optimize import linear_sum_assignment
 
+        size = size or self.size
+        reach = REACH_SHARE * max(size)
         points = np.asarray(positions_px, dtype=float).reshape(-1, 2)
         numbers = [-1] * len(points)
         # In a frame that could not be read nothing was seen.
@@ -85,13 +93,14 @@ class Tracker:
         self._tracks = [track for track in self._tracks if track.unseen <= LOST_FRAMES]
         self._next = index + 1
         # continue tracks
-        if len(points) and self._tracks:
-            expected = np.array([track.position + DAMPING * track.step for track in self._tracks])
+        tracks = [track for track in self._tracks if track.size == size]
+        if len(points) and tracks:
+            expected = np.array([track.position + DAMPING * track.step for track in tracks])
             gaps = np.linalg.norm(points[:, None] - expected[None], axis=2)
             # Beyond its reach a pairing is worth no more than none.
-            for i, j in zip(*linear_sum_assignment(np.minimum(gaps, self.reach)), strict=True):
-                if gaps[i, j] < self.reach:
-                    track = self._tracks[j]
+            for i, j in zip(*linear_sum_assignment(np.minimum(gaps, reach)), strict=True):
+                if gaps[i, j] < reach:
+                    track = tracks[j]
                     track.step = (points[i] - track.position) / (track.unseen + 1)
                     track.position, track.unseen = points[i], -1
                     numbers[i] = track.number
@@ -103,6 +112,6 @@ class Tracker:
         for i, number in enumerate(numbers):
             if number < 0:
                 numbers[i] = self._count
-                self._tracks.append(_Moving(self._count, points[i]))
+                self._tracks.append(_Moving(self._count, points[i], size))
                 self._count += 1
         return numbers

@@ -24,6 +24,7 @@ from typing import Any
 from simtest.errors import BackendError, InputError
 from simtest.runtime.boundary import suggestion
 from simtest.runtime.files import Json, user_cache, write_json
+from simtest.runtime.messages import LOGGER
 
 
 class _Late:
@@ -304,6 +305,7 @@ def _set_library(needed: bool) -> None:
     for failed in tried[:-1]:
         if failed.origin == LIBRARY_VARIABLE:
             warnings.warn(f"{LIBRARY_VARIABLE}={failed.path}: {failed.verdict}; using {chosen.path}", stacklevel=3)
+    LOGGER.debug("libLLVM is %s (%s)", chosen.path, chosen.origin)
     os.environ[LIBRARY_VARIABLE] = chosen.path
     _chosen.add(chosen.path)
 

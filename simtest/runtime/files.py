@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from simtest.errors import InputError
 from simtest.runtime.boundary import shown, suggestion
+from simtest.runtime.messages import LOGGER
 
 if TYPE_CHECKING:
     import polars as pl
@@ -97,6 +98,7 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
         with part.open("rb+") as file:
             os.fsync(file.fileno())
         os.replace(part, path)
+        LOGGER.debug("wrote %s", path)
     except OSError as error:
         if error.errno is not None and error.filename in (None, str(part)):
             raise OSError(error.errno, error.strerror, str(path)) from error

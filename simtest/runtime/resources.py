@@ -12,6 +12,7 @@ from typing import Any
 from simtest.errors import InputError
 from simtest.runtime.boundary import suggestion
 from simtest.runtime.files import as_path, require_plain
+from simtest.runtime.messages import LOGGER
 from simtest.runtime.provenance import file_hash
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -39,11 +40,16 @@ def find(name: str | Path, kind: str, folder: str = "", suffixes: tuple[str, ...
     if path.name == str(name):
         for suffix in suffixes:
             if (shipped := root / f"{path.name}{suffix}").is_file():
+                LOGGER.debug("%s is %s", name, shipped)
                 return shipped
     if path.exists():
         require_plain(path)
     names = sorted({p.stem for s in suffixes for p in root.glob(f"*{s}")})
     meant = suggestion(path.name, names)
+    if root != data_root("scenes"):
+        # A stomach is a scene, tissue_stomach, where colon and liver are meshes and experiments too.
+        scenes = sorted(p.stem for p in data_root("scenes").glob("*.toml"))
+        meant += "".join(f"; {each} is a scene" for each in scenes if path.name in (each, each.rpartition("_")[2]))
     raise InputError(f"{name or repr(name)}: no such file; shipped by name: {', '.join(names)}{meant}")
 
 

@@ -6,15 +6,17 @@ name is enough where only one key of the scene ends so: ``radius_mm`` for ``surf
 
 import copy
 import inspect
+import math
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel
 
 from simtest.errors import InputError
 from simtest.runtime.boundary import suggestion
-from simtest.spec.spec_model import is_model, places, types_of
+from simtest.spec.spec_model import is_model, places, types_of, validate
 from simtest.spec.toml_files import apply_settings
 
 RIVALS = {
@@ -38,6 +40,7 @@ def replace_values(
     the type of the tables, `where` the name of their file.
     """
     result = apply_settings(_without_rivals(data, settings), settings, where)
+    _warn_of_crop(data.get("camera"), result.get("camera"), settings, where)
     for path, value in settings.items():
         *parents, last = path.split(".")
         if last != "type" or not isinstance(value, str):
@@ -54,6 +57,29 @@ def replace_values(
         for key in set(before) - allowed - given:
             table.pop(key, None)
     return result
+
+
+def _warn_of_crop(before: Any, after: Any, settings: Mapping[str, Any], where: str) -> None:
+    """Warn where a setting of the picture's size alone changes the field of view, since the table states fx."""
+    across: Literal["width", "height"] = "width" if "camera.width" in settings else "height"
+    if f"camera.{across}" not in settings or {"camera", "camera.fx", "camera.fy", "camera.fov_deg"} & settings.keys():
+        return
+    if not isinstance(before, Mapping) or "fx" not in before:
+        return
+    # Imported here: the readers of files need no lenses.
+    from simtest.geometry.camera import field_of_view
+    from simtest.spec.camera import SceneCamera
+
+    try:
+        old, new = (field_of_view(validate(SceneCamera, table, where).model(), across) for table in (before, after))
+    except InputError:
+        # Malformed tables are refused with the rest.
+        return
+    if not math.isclose(old, new, rel_tol=1e-3):
+        setting = f"camera.fov_deg={old:.4g}" + " and camera.fov_of=height" * (across == "height")
+        told = f"the field of view across the {across} changes from {old:.4g} to {new:.4g} deg, since fx and fy stay"
+        # Of this place, whoever asks: the same scene is read several times.
+        warnings.warn(f"{where}: camera.{across}: {told}; to keep it set {setting}", stacklevel=1)
 
 
 def _without_rivals(data: Mapping[str, Any], settings: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -1,6 +1,7 @@
 """The command line: what it prints, how it fails, its manners, and that a stopped run goes on."""
 
 import json
+import logging
 import os
 import re
 import signal
@@ -32,6 +33,7 @@ from simtest.errors import InputError
 from simtest.estimators.names import DESCRIPTIONS, ESTIMATORS, describe_estimators, load_estimators
 from simtest.rendering import backend
 from simtest.rendering.backend import BackendReport
+from simtest.runtime import messages
 from simtest.runtime.boundary import suggestion
 from simtest.runtime.resources import OWN
 from simtest.spec import load_dataset, load_experiment, load_profile, load_scene
@@ -135,6 +137,7 @@ BAD_USE = {
     "dataset tiny --out made --workers 0": "workers = 0: must be 1 to 256",
     "dataset verify nowhere": "nowhere: no such folder",
     "dataset sample nowhere 0": "nowhere: no dataset to read (manifest.json: missing)",
+    "validate stomach": "sensor; tissue_stomach is a scene",
     "validate plain": "plain: no such file; shipped by name: anatomy, anatomy_sensor, camera, colon, compare",
     "validate overview --realisations many": "Invalid value for --realisations: many is not a whole number",
     **{
@@ -405,12 +408,6 @@ def test_a_corrupt_record_starts_the_run_again(tmp_path, stopped):
         parts.mkdir()
 
 
-@pytest.fixture(autouse=True)
-def ordinary(monkeypatch):
-    """Leave no handler of warnings behind."""
-    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
-
-
 # Lists and completion --------------------------------------------------------------------------------------------
 
 
@@ -616,6 +613,8 @@ def test_a_command_that_is_gone_says_what_takes_its_place(here):
 def test_flags_stand_anywhere_but_behind_two_dashes():
     assert front.take_flags(["--quiet", "render", "x", "--traceback"]) == (["render", "x"], True)
     assert (front.MANNERS.quiet, front.MANNERS.verbose) == (True, False)
+    assert front.take_flags(["-v", "render"]) == (["render"], False)
+    assert (front.MANNERS.quiet, front.MANNERS.verbose) == (False, True)
     assert front.take_flags(["render", "--", "--verbose"]) == (["render", "--", "--verbose"], False)
     assert (front.MANNERS.quiet, front.MANNERS.verbose) == (False, False)
 
@@ -631,7 +630,7 @@ def warned(*_):
     return BackendReport("llvm_ad_mono", None, [], {}, None)
 
 
-@pytest.mark.parametrize(("flags", "lines"), [((), ["simtest: warning: look here"]), (("--quiet",), [])])
+@pytest.mark.parametrize(("flags", "lines"), [((), ["simtest: warning: look here"]), (("--quiet",), []), (("-q",), [])])
 def test_quiet_leaves_out_warnings(here, monkeypatch, flags, lines):
     monkeypatch.setattr(backend, "examine", warned)
     with warnings.catch_warnings():
@@ -639,6 +638,54 @@ def test_quiet_leaves_out_warnings(here, monkeypatch, flags, lines):
         code, output, errors = here("doctor", *flags)
     assert (code, errors) == (0, lines)
     assert "rendering   works" in output
+
+
+def test_verbose_prints_the_debug_messages_of_the_logger(here):
+    assert here("schema", "-v")[2] == []
+    errors = here("mesh", "colon", "--out", "x.ply", "--edge-mm", "20", "-v")[2]
+    assert any(line.startswith("simtest: debug: colon is ") and line.endswith("colon.toml") for line in errors)
+    assert here("mesh", "colon", "--out", "y.ply", "--edge-mm", "20")[2] == []
+    # Nothing of that stays in the process.
+    logger = logging.getLogger("simtest")
+    assert (logger.level, [type(handler) for handler in logger.handlers]) == (logging.NOTSET, [logging.NullHandler])
+
+
+def test_the_quiet_leave_out_notes(capsys, monkeypatch):
+    told = common.Told(["file"], parts=["note: a note", "a result"])
+    told.print(False)
+    assert capsys.readouterr().out.splitlines() == ["note: a note", "a result", "file"]
+    monkeypatch.setattr(front.MANNERS, "quiet", True)
+    told.print(False)
+    assert capsys.readouterr().out.splitlines() == ["a result", "file"]
+
+
+def test_a_program_gets_warnings_in_the_logger_where_it_asks_for_them(caplog, monkeypatch):
+    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        messages.log_warnings()
+        warnings.warn("look here", stacklevel=1)
+    assert caplog.record_tuples == [("simtest", logging.WARNING, "look here")]
+
+
+SHORT = {"--out": "-o", "--samples": "-n", "--realisations": "-n", "--count": "-n"}
+
+
+def test_options_of_all_commands_have_the_same_short_names():
+    seen = set()
+
+    def look(app):
+        for name in app:
+            if not name.startswith("-"):
+                look(app[name])
+        if app.default_command is not None:
+            for argument in app.assemble_argument_collection():
+                for name in set(argument.names) & set(SHORT):
+                    assert SHORT[name] in argument.names, (app.name, argument.names)
+                    seen.add(name)
+
+    look(commands.APP)
+    assert seen == set(SHORT)
 
 
 def steps(capsys):

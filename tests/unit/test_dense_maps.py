@@ -387,6 +387,21 @@ def test_a_wrong_scale_is_told_and_mended_by_alignment(tmp_path):
     assert any("factor 1000" in line for line in score.lines)
 
 
+@pytest.mark.parametrize(("unit_mm", "given", "name"), [(1000, None, "m"), (10, None, "cm"), (1, 1000, "mm")])
+def test_a_wrong_unit_of_depths_is_warned_of(unit_mm, given, name, tmp_path):
+    truth = sphere_truth()
+    np.save(tmp_path / "a_depth.npy", 1.1 * truth.distance / unit_mm)
+    (warning,) = (line for line in scored(tmp_path, truth, depth="ray", unit_mm=given).lines if "--unit-mm" in line)
+    assert warning == (
+        f"warning: depths: read in units of {given or 1} mm, the truth is about {unit_mm / (given or 1):g} times them, "
+        f"as if they were in {name}; --unit-mm {unit_mm} says so"
+    )
+    # The right unit, and a scale that is none of a unit, are no reason.
+    assert not any("--unit-mm" in line for line in scored(tmp_path, truth, depth="ray", unit_mm=unit_mm).lines)
+    np.save(tmp_path / "a_depth.npy", truth.distance / 300)
+    assert not any("--unit-mm" in line for line in scored(tmp_path, truth, depth="ray").lines)
+
+
 def test_a_shift_is_mended_by_the_affine_alignment_alone(tmp_path):
     truth = sphere_truth()
     np.save(tmp_path / "a.npy", 0.5 * truth.distance - 4.0)

@@ -15,6 +15,8 @@ from test_colour_detection import HEIGHT, WIDTH, lobe, picture
 import simtest
 from simtest.api import Extras, reconstruct_picture
 from simtest.calibration import Normal, Priors, Response
+from simtest.cli import pictures
+from simtest.cli.common import PictureOptions
 from simtest.detection.detector import load_detector
 from simtest.errors import InputError
 from simtest.geometry import Camera
@@ -359,7 +361,7 @@ def test_a_broken_picture_behind_a_stranger_is_passed_over(folder, tmp_path):
     options = Options(camera=tmp_path / "camera.toml", poses=tmp_path / "poses.json")
     with pytest.warns(UserWarning, match="frame 0: .* must be 320 x 240|frame 1: .* no picture"):
         made = reconstruct_sequence(folder, tmp_path / "out", options)
-    assert (made.frames, made.failed) == (4, 2)
+    assert (made.frames, made.failed, made.not_named) == (4, 2, 1)
 
 
 @pytest.mark.ci
@@ -385,12 +387,49 @@ def test_a_film_takes_little_memory(folder, tmp_path):
 
 def test_a_broken_picture_in_a_folder_is_told_and_passed_over(folder, tmp_path):
     (folder / "frame5.png").write_text("no picture")
-    save(folder / "frame7.png", frame()[:100])
     result, texts = noted(folder, tmp_path / "out")
     assert "frame 2: " in texts
     assert "no picture (10 bytes)" in texts
-    assert "must be 320 x 240" in texts
-    assert (result.frames, result.failed, result.tracks) == (5, 2, 2)
+    assert (result.frames, result.failed, result.tracks) == (4, 1, 2)
+
+
+@pytest.fixture
+def of_two_sizes(folder):
+    save(folder / "frame7.png", frame()[:200, :300])
+    return folder
+
+
+def test_a_field_of_view_gives_each_size_a_camera(of_two_sizes, tmp_path, capsys):
+    with pytest.warns(UserWarning, match="angles depend") as caught:
+        code = pictures.reconstruct(of_two_sizes, out=tmp_path / "out", known=PictureOptions(fov_deg=FOV))
+    assert (code, len(caught)) == (0, 1)
+    printed = capsys.readouterr().out
+    assert "4 frames: 8 specularities, 2 seen in several frames" in printed
+    assert f"note: 320 x 240 px (3 frames), 300 x 200 px (1 frame): each size has a camera of {FOV:g} deg" in printed
+    cameras = [json.loads((tmp_path / "out" / "frames" / f"00000{i}.json").read_text())["camera"] for i in range(4)]
+    widths, focal = [320, 320, 300, 320], 0.5 / np.tan(np.radians(FOV) / 2)
+    np.testing.assert_allclose([each["K"][0][0] for each in cameras], np.multiply(widths, focal))
+    # Frames of the other size have other tracks, and end none.
+    assert sorted(len(track["frames"]) for track in json.loads((tmp_path / "out" / "tracks.json").read_text())) == [
+        1, 1, 3, 3,
+    ]  # fmt: skip
+
+
+def test_pictures_of_another_size_than_the_cameras_are_refused_before_the_work(of_two_sizes, tmp_path):
+    simtest.save_calibration(simtest.Calibration(CAMERA), tmp_path / "camera.toml")
+    words = r"is of 320 x 240 px, and 1 of 4 pictures are of another size: frame7\.png \(300 x 200\); give"
+    with pytest.raises(InputError, match=words) as raised:
+        reconstruct_sequence(of_two_sizes, tmp_path / "out", Options(camera=tmp_path / "camera.toml"))
+    assert "\n" not in str(raised.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_skipped_picture_is_counted_and_makes_the_exit_code_1(folder, tmp_path, capsys):
+    (folder / "frame5.png").write_text("no picture")
+    with pytest.warns(UserWarning, match="angles depend|no picture"):
+        code = pictures.reconstruct(folder, out=tmp_path / "out", known=PictureOptions(fov_deg=FOV))
+    assert code == 1
+    assert "4 frames, 1 skipped: 6 specularities" in capsys.readouterr().out
 
 
 def video(path, count):

@@ -130,3 +130,19 @@ def test_what_is_none_is_left_out():
     assert tomllib.loads(toml_tables({"a": {"x": None, "y": {"z": None, "w": 1}}, "b": {"v": [True, 1.5]}})) == {
         "a": {"y": {"w": 1}}, "b": {"v": [True, 1.5]},
     }  # fmt: skip
+
+
+def test_a_size_that_changes_the_field_of_view_is_warned_of():
+    told = (
+        r"tissue_colon\.toml: camera\.width: the field of view across the width changes from 90 to 53\.13 deg, since "
+        r"fx and fy stay; to keep it set camera\.fov_deg=90$"
+    )
+    with pytest.warns(UserWarning, match=told) as caught:
+        cropped = load_scene("tissue_colon", {"camera.width": 320, "camera.height": 240}).camera
+    assert (len(caught), cropped.fx) == (1, 320.0)
+    with pytest.warns(UserWarning, match=r"across the height .* set camera\.fov_deg=73\.74 and camera\.fov_of=height$"):
+        load_scene("tissue_colon", {"camera.height": 240})
+    # What is advised keeps it, and so does a focal length; both without a word, as warnings are errors here.
+    kept = load_scene("tissue_colon", {"camera.width": 320, "camera.height": 240, "camera.fov_deg": 90}).camera
+    assert kept.fx == pytest.approx(160.0)
+    load_scene("tissue_colon", {"camera.width": 320, "camera.fx": 160.0, "camera.fy": 160.0})

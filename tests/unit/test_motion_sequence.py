@@ -136,12 +136,12 @@ def test_a_picture_that_the_poses_do_not_name_is_passed_over(film, tmp_path):
     options.poses.write_text(json.dumps(named))
     with pytest.warns(UserWarning, match=r"frame 0: sheet\.png: frame is 60 x 40 px: must be 320 x 320"):
         made = reconstruct_sequence(tmp_path / "frames", tmp_path / "out", options)
-    assert made.failed == 1
+    assert (made.failed, made.not_named) == (1, 1)
     assert made.motion.startswith("bends of 4 highlights: 4 convex")
-    # A first picture that the poses name is refused: the camera is not that of the frames.
+    # One that the poses name is refused: the camera is not that of the frames.
     named["frames"].append({"frame": "sheet.png", "world_from_camera": np.eye(4).tolist()})
     options.poses.write_text(json.dumps(named))
-    with pytest.raises(InputError, match=r"sheet\.png: frame is 60 x 40 px"):
+    with pytest.raises(InputError, match=r"of another size: sheet\.png \(60 x 40\)"):
         reconstruct_sequence(tmp_path / "frames", tmp_path / "refused", options)
 
 

@@ -94,7 +94,8 @@ def test_pictures_of_a_reconstruction(found):
     for record in (found, found[0]):
         html = record._repr_html_()
         assert html.count("data:image/jpeg;base64,") == 1
-        assert found.choices.estimators[-1] in html
+    assert "<td>sightline rule</td>" in found._repr_html_()
+    assert found.choices.estimators[-1] in found[0]._repr_html_()
     estimate = found[0].estimates["cone_axis"]
     html = estimate._repr_html_()
     assert "<svg" in html

@@ -10,10 +10,12 @@ import pytest
 from simtest import reconstruct
 from simtest.calibration import Calibration, Priors
 from simtest.calibration.priors import exactly
+from simtest.cli.pictures import record_tables
 from simtest.estimators.prior_parts import relief_part
 from simtest.geometry import Camera
 from simtest.geometry.vectors import tangent_basis
 from simtest.reconstruction.outputs import write_outputs
+from simtest.reconstruction.page import write_picture_page
 from simtest.validation.references import compare
 
 CAMERA = Camera.from_fov(60.0, 160, 120)
@@ -100,13 +102,21 @@ def rule_and_rows(priors):
     return spots, spots.sightline_rule, list(spots.reference.rows)
 
 
-def test_estimators_that_are_the_reversed_sightline_are_one_row():
+def test_estimators_that_are_the_reversed_sightline_are_one_row(tmp_path):
     spots, rule, rows = rule_and_rows(Priors())
     assert set(rule) == {"brightest_point", "cone_axis", "curved"}
     assert rows == ["sightline rule"]
     assert spots.reference.rows["sightline rule"].mean_deg == spots[0].reference.errors[spots[0].best].error_deg
     assert set(spots.reference.estimators) == set(rule)
     assert "are one sightline rule: they differ" in spots.rule_note
+    page = tmp_path / "index.html"
+    write_picture_page(page, spots, np.zeros((10, 10, 3), np.float32))
+    data = json.loads(page.read_text().partition('type="application/json">')[2].partition("</script>")[0])
+    assert ([row["name"] for row in data["spots"][0]["rows"]], [*data["colours"]]) == (rows, rows)
+    assert data["spots"][0]["best"] == "sightline rule"
+    assert "simtest calibrate light finds the light" in page.read_text()
+    assert "<td>sightline rule</td>" in spots._repr_html_()
+    assert next(record_tables(spots)).rows[0][5] == "sightline rule"
 
 
 def test_with_a_light_beside_the_camera_each_estimator_has_its_row():

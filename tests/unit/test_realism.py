@@ -1,9 +1,11 @@
 """Realism: statistics on pictures that have a known value, distances against scipy, sets of frames."""
 
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
+import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,8 +13,10 @@ from scipy import stats
 
 import simtest.rendering
 from simtest.cli.data import realism
+from simtest.dataset.index import SAMPLES
 from simtest.dataset.shard_writer import write_dataset
 from simtest.errors import InputError
+from simtest.realism import frames as realism_frames
 from simtest.realism.compare import compare, distances
 from simtest.realism.fitting.bank import FrameMaker, one_family
 from simtest.realism.frames import NamedFrame, open_frames, open_generated, rendered_frames, varied
@@ -368,6 +372,28 @@ def test_bad_input_is_one_line(tmp_path, frames, against, more, words):
     with pytest.raises(InputError, match=words) as raised:
         realism([tmp_path / frames], against=against, out=tmp_path / "out", **more)
     assert "\n" not in str(raised.value)
+
+
+def test_a_surface_is_named_by_its_kind_or_by_its_scene(tmp_path, monkeypatch):
+    """A stomach's surface is a colon of a wide lumen: it goes by its scene."""
+    (tmp_path / "manifest.json").touch()
+    pl.DataFrame({
+        "surface": ["colon", "colon", "liver"], "family": [0, 1, 2], "anatomy": [0, 0, 0], "key": ["a", "b", "c"],
+        "shard": ["s"] * 3, "index": [0, 1, 2],
+    }).write_parquet(tmp_path / SAMPLES)  # fmt: skip
+    families = [{"scene": name} for name in ("tissue_colon", "tissue_stomach", "tissue_liver")]
+    monkeypatch.setattr(realism_frames, "shard_names", lambda _: ["s"])
+    monkeypatch.setattr(realism_frames, "open_manifest", lambda _: SimpleNamespace(dataset={"families": families}))
+
+    def names(*surfaces):
+        return [frame.name for frame in open_generated(str(tmp_path), 9, surfaces)]
+
+    assert names("stomach") == names("tissue_stomach") == ["b"]
+    assert names("colon") == ["a", "b"]
+    assert names("tissue_colon", "liver") == ["a", "c"]
+    words = "--surface lung: .* has none; it has colon, liver, tissue_colon, tissue_stomach, tissue_liver$"
+    with pytest.raises(InputError, match=words):
+        names("lung")
 
 
 def test_a_set_without_frames_to_measure_is_refused():

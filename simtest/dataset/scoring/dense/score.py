@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from simtest.dataset.scoring.dense.depth import ALIGNMENTS, align, depth_factor, normals_of_distance
-from simtest.dataset.scoring.dense.maps import Answer, Fit, MapOptions, Method, decode_depth, open_method
+from simtest.dataset.scoring.dense.maps import Answer, Fit, MapFolder, MapOptions, Method, decode_depth, open_method
 from simtest.dataset.scoring.dense.page import Shown, picture_row, write_dense_page
 from simtest.dataset.scoring.dense.truth import (
     ANGLE,
@@ -44,6 +44,12 @@ from simtest.validation.runner import Progress
 TABLE, SUMMARY, PAGE = "dense.parquet", "dense.json", "index.html"
 SCHEMA = 3
 
+UNITS = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3}
+"""mm of one unit."""
+
+SAME_UNIT = 1.25
+"""Depths are taken for those of another unit where the factors of all frames are that of the unit up to this one."""
+
 MOST_SHOWN, LEAST_SHOWN = 6, 3
 """Frames that the page shows: one of each setting up to the larger number, and the first ones up to the smaller."""
 
@@ -56,6 +62,7 @@ class DenseScore:
     on: str  # the run or dataset, as it was named
     options: MapOptions  # how maps are read
     sources: tuple[str, ...]  # sources that some frame has; a frame without one counts as unanswered there
+    has_unit: bool = True  # whether the depths are of a unit at all, as those of files are
     fit: Fit = field(init=False)  # how well the maps fit the truth as they are read
     # frames, frames without any map, scored pixels, and pixels excluded by reason
     counts: dict[str, int] = field(
@@ -187,10 +194,24 @@ class DenseScore:
                 }  # fmt: skip
         return summary
 
+    def _unit_lines(self) -> Iterator[str]:
+        """Yield a warning where a factor between units would bring the depths of every frame to the truth."""
+        factor = self.alignment_summary().get("scale", {}).get("factor")
+        if factor is None or not self.has_unit:
+            return
+        given = 1.0 if self.options.unit_mm is None else self.options.unit_mm
+        for name, unit_mm in UNITS.items():
+            near = sorted(factor[each] * given / unit_mm for each in ("least", "median", "largest"))
+            if not np.isclose(unit_mm, given) and near[0] * SAME_UNIT >= 1 and near[2] <= SAME_UNIT:
+                yield (
+                    f"warning: depths: read in units of {given:g} mm, the truth is about {unit_mm / given:g} times "
+                    f"them, as if they were in {name}; --unit-mm {unit_mm:g} says so"
+                )
+
     @property
     def lines(self) -> list[str]:
         """What is told in words: conventions, alignments, and what was not answered."""
-        told = self.fit.lines()
+        told = [*self.fit.lines(), *self._unit_lines()]
         for how, found in self.alignment_summary().items():
             if turned := found["frames_turned_round"]:
                 told.append(
@@ -236,7 +257,7 @@ def score_frames(
     options = method.options(options)
     sources: tuple[str, ...] = (NORMAL,) if "normal" in method.kinds else ()
     sources += tuple(map(depth_source, ALIGNMENTS)) if "depth" in method.kinds else ()
-    score = DenseScore(options.name or method.name, on, options, sources)
+    score = DenseScore(options.name or method.name, on, options, sources, isinstance(method, MapFolder))
     names = []
     for truth in frames:
         names.append(truth.name)
