@@ -29,8 +29,7 @@ FEW = 5
 """Answers of a cell, at least, of which not all may have the same axis ratio."""
 
 MOTION_RATE = 0.04
-"""Chance that one of the two signs that motion tells of a highlight is wrong, at most: 2 % each (docs/howto/pictures.md).
-"""
+"""Chance that one of the two signs of a highlight is wrong, at most: 2 % each (docs/howto/pictures.md)."""
 
 ALPHA = 1e-4
 """Chance that signs at this rate break the rule. Measured rates lie far below it, and this level lets three highlights,
