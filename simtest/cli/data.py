@@ -342,18 +342,20 @@ def advise(
 
 
 def _advice(advised: "Advised") -> "Iterator[str | Table]":
-    from simtest.advice.advise import NOTHING, interval, sentence
-    from simtest.advice.plan import DISTANCES
+    from simtest.advice.advise import NOTHING, counts, interval, sentence
     from simtest.pages.style import number
 
-    rows = [
-        (m.estimator, m.target, f"{m.answered} of {m.asked}", number(m.fine.mean_deg), interval(m.fine.interval_deg),
-         number(m.base.mean_deg), interval(m.base.interval_deg))
-        for m in advised.answers.methods
-    ]  # fmt: skip
-    columns = ("method", "states", "answered", "error, fine", "95 % interval", "error, base", "95 % interval")
-    yield Table(columns, rows)
-    yield f"{advised.answers.frames} frames, {advised.question.per_distance} at each of {DISTANCES} distances"
+    rows = []
+    for m in advised.answers.methods:
+        beside = advised.answers.beside(m.estimator)
+        difference = f"{number(beside.mean_deg)} ({beside.highlights})" if beside else "–"
+        rows.append((m.estimator, m.target, f"{m.answered} of {m.asked}", number(m.fine.mean_deg),
+                     interval(m.fine.interval_deg), number(m.base.mean_deg), interval(m.base.interval_deg),
+                     difference))  # fmt: skip
+    columns = ("method", "states", "answered", "error, fine", "95 % interval", "error, base", "95 % interval",
+               "minus the first's")  # fmt: skip
+    yield Table(columns, rows, width=140)
+    yield counts(advised.answers)
     breaks = [
         (b.title, b.method, f"{b.quantity} {number(b.value)} {b.unit}".strip(),
          "refuses" if b.expected is None else number(b.expected))
