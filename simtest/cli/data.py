@@ -1,5 +1,6 @@
 """Commands about frames for learning and about real ones: dataset, realism, fit, advise."""
 
+import shlex
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -131,6 +132,7 @@ def sample(
     index : int
         Of the sample, from 0.
     """
+    from simtest.dataset.reader import open_manifest
     from simtest.dataset.verify import compare, reproduce_sample
 
     target = out or Path(f"sample-{index}")
@@ -138,7 +140,11 @@ def sample(
     verdict = compare(folder, index, target)
     same = verdict.endswith("same bytes")
     record = {"same": same, "verdict": verdict, "files": files}
-    return Told(data=record, parts=[*files, verdict], code=0 if same else 1)
+    # With another variant the frame has other noise.
+    rendered = variant or open_manifest(folder).origin["variant"]
+    scene = next(str(file) for file in files if file.suffix == ".json")
+    again = shlex.join(["simtest", "render", scene, "--variant", rendered])
+    return Told(data=record, parts=[*files, f"its frame, rendered again: {again}", verdict], code=0 if same else 1)
 
 
 @dataset.command
@@ -203,7 +209,7 @@ def realism(
 
     real, generated = open_frames(frames), open_generated(against, count, surfaces or ())
     stopped = "an earlier page stays; the same command begins anew"
-    with exclusive_folder(out), progress_bar("compared", stopped) as progress:
+    with exclusive_folder(out), progress_bar("comparing the distributions", stopped) as progress:
         # Before the frames are measured, which takes long.
         scenes = [len({frame.scene for frame in side}) for side in (real, generated)]
         if min(scenes) < LEAST_SCENES:
