@@ -163,17 +163,19 @@ def _written(plan: Plan, folder: Path, shard: Shard) -> dict[str, pl.DataFrame]:
         return shard_tables(plan, folder, shard)
 
 
-JUDGED = {SAMPLES: ["index", "n_isolated"], HIGHLIGHTS: ["index", "isolated", "why_not", "peak_snr"]}
+JUDGED = {SAMPLES: ["index", "n_highlights", "n_isolated"], HIGHLIGHTS: ["index", "isolated", "why_not", "peak_snr"]}
 """Columns that `shortfall` needs."""
 
 
 def shortfall(plan: Plan, tables: Mapping[str, pl.DataFrame]) -> str:
     """Return how many samples show too few isolated highlights, why, and what to change; empty where none does.
 
-    A recipe that takes every frame is told where most show none.
+    A recipe that takes every frame is told where most show no highlight at all.
     """
     dataset, samples = plan.dataset, tables[SAMPLES]
-    few = samples.filter(pl.col("n_isolated") < max(dataset.highlights, 1))
+    few = samples.filter(
+        pl.col("n_isolated") < dataset.highlights if dataset.highlights else pl.col("n_highlights") == 0
+    )
     if few.is_empty() or (not dataset.highlights and few.height <= samples.height / 2):
         return ""
     # That of the highlight which stands out most, as in `simtest views`.
@@ -187,7 +189,7 @@ def shortfall(plan: Plan, tables: Mapping[str, pl.DataFrame]) -> str:
         text += f"fewer isolated highlights than highlights = {dataset.highlights} asks for; the last of "
         text += f"tries = {dataset.tries} draws was taken"
     else:
-        text += "no isolated highlight"
+        text += "no highlight"
     text += f" ({', '.join(f'{count}: {reason}' for reason, count in counts.iter_rows())})"
     if remedy := REMEDIES.get(counts["why_not"][0]):
         text += f"; {remedy}"

@@ -893,17 +893,21 @@ def test_samples_below_the_recipes_number_of_highlights_are_counted(tmp_path):
 
 
 def test_why_samples_show_too_few_highlights_is_that_of_the_highlight_that_stands_out_most():
-    samples = pl.DataFrame({"index": [0, 1, 2, 3], "n_isolated": [0, 0, 0, 1]})
+    samples = pl.DataFrame({"index": [0, 1, 2, 3], "n_highlights": [2, 1, 0, 1], "n_isolated": [0, 0, 0, 1]})
     rows = [(0, False, FAINT, 3.0), (0, False, STREAK, 40.0), (1, False, STREAK, 20.0), (3, True, None, 50.0)]
     highlights = pl.DataFrame(rows, schema=["index", "isolated", "why_not", "peak_snr"], orient="row")
     dataset = SimpleNamespace(highlights=1, tries=8)
     plan = SimpleNamespace(dataset=dataset, inputs=[Path("tube.toml"), Path("tube.obj")])
     said = shortfall(plan, {INDEX: samples, HIGHLIGHTS: highlights})
     assert f"(2: {STREAK}, 1: {NO_HIGHLIGHT}); {REMEDIES[STREAK]}; `simtest mesh check` says whether tube.obj" in said
-    # A recipe that takes every frame is told where most of them show none.
-    dataset.highlights = 0
-    assert shortfall(plan, {INDEX: samples, HIGHLIGHTS: highlights}).startswith("3 of 4 samples show no isolated hi")
     assert not shortfall(plan, {INDEX: samples[3:], HIGHLIGHTS: highlights})
+    # A recipe that takes every frame is told where most of them show no highlight at all.
+    dataset.highlights = 0
+    assert not shortfall(plan, {INDEX: samples, HIGHLIGHTS: highlights})
+    none = samples.with_columns(n_highlights=pl.Series([0, 0, 0, 1]))
+    assert shortfall(plan, {INDEX: none, HIGHLIGHTS: highlights[3:]}).startswith(
+        f"3 of 4 samples show no highlight (3: {NO_HIGHLIGHT}); "
+    )
 
 
 def test_a_samples_metadata_are_a_scene_that_is_rendered_again(made, tmp_path):
