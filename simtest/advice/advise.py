@@ -35,6 +35,7 @@ from simtest.simulation.sensor import displayed
 from simtest.spec import Experiment, load_scene
 from simtest.spec.toml_files import toml_tables
 from simtest.validation import laws
+from simtest.validation.guide import LEAST_ANSWERED
 from simtest.validation.runner import Progress, run_experiments
 
 MAIN, SCENE, FRAME, RUN = "experiment.toml", "scene.toml", "frame.png", "run"
@@ -144,7 +145,7 @@ def write_advice(advised: Advised, out: Path, command: str = "") -> Path:
         advised=advised, sentences=[sentence(advised, choice) for choice in advised.answers.choices] or [NOTHING],
         chart=chart, picture=pixels.data_address(advised.picture, PICTURE_HEIGHT_PX), command=command,
         narrower=narrower(advised, command), distances=DISTANCES,
-        interval=interval, surfaces=_SURFACES,
+        interval=interval, counts=counts(advised.answers),
         parts=list(dict.fromkeys(name for each in advised.answers.methods for name in each.budget_deg)),
         provenance={"commit": about["commit"] or "–", "simtest": about["version"], "python": about["python"]},
         **embedded([chart]),
@@ -168,10 +169,45 @@ def sentence(advised: Advised, choice: Choice) -> str:
     text += f" (95 % interval {interval(method.own.interval_deg)}), {method.answered} of {method.asked} answered."
     if choice.ties:
         text += f" It cannot be told from {', '.join(choice.ties)}."
-    text += _nearer(advised, method)
+    text += _smaller_means(advised, choice) + _nearer(advised, method)
     if method.own.is_wide:
         text += f" The interval is wide: {_remedy(advised, choice)}"
     return text
+
+
+def _smaller_means(advised: Advised, choice: Choice) -> str:
+    """Return why methods with a smaller mean error than the best are not recommended, a sentence each."""
+    text, best = "", advised.answers.method(choice.best or "").own.mean_deg or 0.0
+    for each in choice.others:
+        method, difference = advised.answers.method(each.other), each.mean_deg
+        if method.own.mean_deg is None or method.own.mean_deg >= best:
+            continue
+        text += (
+            f" {each.other} has a smaller mean, {number(method.own.mean_deg)} deg, over its {method.answered} answers"
+        )
+        if difference is None:
+            text += "; there is no highlight that both answered."
+            continue
+        side = "larger" if difference >= 0 else "smaller"
+        text += f": over the {each.highlights} that both answered its error is {number(abs(difference))} deg {side}"
+        if difference < 0:
+            if each.tied:
+                text += ", but the two cannot be told apart"
+            elif method.answered < LEAST_ANSWERED * method.asked:
+                text += ", but it answers fewer than half"
+            else:
+                text += ", but other methods are better than it"
+        text += "."
+    return text
+
+
+def counts(answers: Answers) -> str:
+    """Return what was rendered and detected; the numbers of detections add up."""
+    return (
+        f"{answers.frames} frames show {answers.visible} visible highlights; the detector found {answers.found} of "
+        f"them. Its {answers.detections} detections: {answers.matched} at a true highlight, {answers.unmatched} in a "
+        f"visible highlight that melts several glints or holds none, {answers.false} false."
+    )
 
 
 def _nearer(advised: Advised, best: MethodAnswers) -> str:

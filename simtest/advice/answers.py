@@ -76,7 +76,7 @@ class Difference:
     """Mean of another method's error minus the best one's over the highlights that both answered, deg."""
 
     other: str
-    mean_deg: float
+    mean_deg: float | None  # None where both answered no highlight
     interval_deg: Interval
     highlights: int
     tied: bool  # whether the two cannot be told apart, or differ too little to matter
@@ -89,7 +89,7 @@ class Choice:
     target: str
     best: str | None  # None where nothing was answered
     ties: tuple[str, ...]
-    next: Difference | None
+    others: tuple[Difference, ...]  # of the other methods that answered, in the order of the ranking
     by_distance: Mapping[float, MethodFigures]
 
 
@@ -101,13 +101,19 @@ class Answers:
     visible: int  # visible highlights that stand above the noise; on a smooth surface all true ones
     found: int  # those of them that the detector found
     detections: int
+    matched: int  # detections that hold a true highlight: what the methods of the fine surface are asked about
+    unmatched: int  # detections in a visible highlight that melts several glints or holds none
     false: int  # detections that show no highlight
-    methods: list[MethodAnswers]
+    methods: list[MethodAnswers]  # those of a choice together, the best first, in the order of the ranking
     choices: list[Choice]  # for the fine surface and, where a method states it, the base
 
     def method(self, name: str) -> MethodAnswers:
         """Return a method by name."""
         return next(each for each in self.methods if each.estimator == name)
+
+    def beside(self, name: str) -> Difference | None:
+        """Return how a method compares with the best; None for the best, and for one that did not answer."""
+        return next((each for choice in self.choices for each in choice.others if each.other == name), None)
 
     def to_json(self) -> dict[str, Any]:
         """Return all figures as JSON."""
@@ -123,24 +129,28 @@ def read_results(results: pl.DataFrame, frames: int, distances: int = DISTANCES)
     rows = rows.with_columns(pl.format("{} mm", STRATUM).alias("setting"))
     targets = targets_of(rows)
     single = next((name for name, target in targets.items() if target == "fine"), None)
-    visible, found, detections, false = _counted(rows.filter(pl.col("estimator") == single))
+    counted, choices = _counted(rows.filter(pl.col("estimator") == single)), _choices(rows)
+    # What the recommendation goes by is what the table is sorted by.
+    ranked = [name for choice in choices if choice.best for name in (choice.best, *(d.other for d in choice.others))]
+    order = dict.fromkeys([*ranked, *targets])
     # Not of the distances that have rows: one without a highlight has none.
-    methods = [_answers(name, target, rows, frames // distances) for name, target in targets.items()]
-    return Answers(frames, visible, found, detections, false, methods, _choices(rows))
+    methods = [_answers(name, targets[name], rows, frames // distances) for name in order]
+    return Answers(frames, *counted, methods, choices)
 
 
-def _counted(rows: pl.DataFrame) -> tuple[int, int, int, int]:
-    """Return visible highlights, those found, detections, and false ones, from the rows of one method."""
+def _counted(rows: pl.DataFrame) -> tuple[int, int, int, int, int, int]:
+    """Return visible highlights, those found, and detections: all, matched, unmatched and false; from one method."""
     detected = rows.filter(pl.col("specularity").is_not_null())
-    false = detected.filter(is_false(detected)).height
+    matched, false = detected["true_id"].count(), detected.filter(is_false(detected)).height
+    kinds = detected.height, matched, detected.height - matched - false, false
     if rows["frame_visible"].null_count() == rows.height:
         # On a smooth surface a visible highlight is a true one.
         true = rows.filter(pl.col("true_id").is_not_null())
         # Without a detection a highlight is not found, whatever its status: in the dark it is no missed one.
-        return true.height, true.drop_nulls("specularity").height, detected.height, false
+        return true.height, true.drop_nulls("specularity").height, *kinds
     visible = rows.group_by(FRAME).agg(pl.col("frame_visible").max())["frame_visible"].sum()
     hit = detected.drop_nulls("visible_id").unique([*FRAME, "visible_id"]).height
-    return int(visible), hit, detected.height, false
+    return int(visible), hit, *kinds
 
 
 def _asked(rows: pl.DataFrame, target: str) -> pl.DataFrame:
@@ -207,21 +217,23 @@ def _choices(rows: pl.DataFrame) -> list[Choice]:
 def _choice(advice: Advice) -> Choice:
     ties = (*advice.ties, *advice.unranked)
     by_distance = {float(setting.split()[0]): figures for setting, figures in advice.by_setting.items()}
-    others = [name for name in advice.methods if name != advice.best and advice.methods[name].answered]
-    following = None
-    if advice.best is not None and others:
-        second = best_of(advice.pairs, others)
-        pair = next(pair for pair in advice.pairs if {pair.first, pair.second} == {advice.best, second})
-        following = _difference(pair, second, second in ties)
-    return Choice(advice.target, advice.best, ties, following, by_distance)
+    if advice.best is None:
+        return Choice(advice.target, None, ties, (), by_distance)
+    others, left = list[Difference](), [n for n, own in advice.methods.items() if own.answered and n != advice.best]
+    # As in the guide: of methods that the pairs leave alike, the one that answers more comes first.
+    left.sort(key=lambda name: -advice.methods[name].answered)
+    while left:
+        name = best_of(advice.pairs, [name for name in left if not advice.methods[name].is_silent] or left)
+        left.remove(name)
+        pair = next(pair for pair in advice.pairs if {pair.first, pair.second} == {advice.best, name})
+        others.append(_difference(pair, name, name in ties))
+    return Choice(advice.target, advice.best, ties, tuple(others), by_distance)
 
 
-def _difference(pair: Pair, other: str, tied: bool) -> Difference | None:
+def _difference(pair: Pair, other: str, tied: bool) -> Difference:
     mean, (low, high) = pair.difference_deg, pair.interval_deg
-    if mean is None:
-        return None
     if other != pair.first:
-        mean = -mean
+        mean = None if mean is None else -mean
         if low is not None and high is not None:
             low, high = -high, -low
     return Difference(other, mean, (low, high), pair.n, tied)

@@ -298,7 +298,7 @@ class Table:
         # Without the names of emojis, which take as long to load as the table to print.
         console = Lines(emoji=False)
         console.width = max(console.width, self.width)
-        drawn = Drawn(*self.columns, title=self.title, title_justify="left")
+        drawn = Drawn(*self.columns, title=self.title and escape(self.title), title_justify="left")
         rows, more = first(self.rows)
         for row in rows:
             drawn.add_row(*(escape(cell) for cell in row))

@@ -1,5 +1,6 @@
 """Commands about frames for learning and about real ones: dataset, realism, fit, advise."""
 
+import shlex
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -132,6 +133,7 @@ def sample(
     index : int
         Of the sample, from 0.
     """
+    from simtest.dataset.reader import open_manifest
     from simtest.dataset.verify import compare, reproduce_sample
 
     target = out or Path(f"sample-{index}")
@@ -139,7 +141,11 @@ def sample(
     verdict = compare(folder, index, target)
     same = verdict.endswith("same bytes")
     record = {"same": same, "verdict": verdict, "files": files}
-    return Told(data=record, parts=[*files, verdict], code=0 if same else 1)
+    # With another variant the frame has other noise.
+    rendered = variant or open_manifest(folder).origin["variant"]
+    scene = next(str(file) for file in files if file.suffix == ".json")
+    again = shlex.join(["simtest", "render", scene, "--variant", rendered])
+    return Told(data=record, parts=[*files, f"its frame, rendered again: {again}", verdict], code=0 if same else 1)
 
 
 @dataset.command
@@ -205,7 +211,7 @@ def realism(
 
     real, generated = open_frames(frames), open_generated(against, count, surfaces or ())
     stopped = "an earlier page stays; the same command begins anew"
-    with exclusive_folder(out), progress_bar("compared", stopped) as progress:
+    with exclusive_folder(out), progress_bar("comparing the distributions", stopped) as progress:
         # Before the frames are measured, which takes long.
         scenes = [len({frame.scene for frame in side}) for side in (real, generated)]
         if min(scenes) < LEAST_SCENES:
@@ -344,18 +350,20 @@ def advise(
 
 
 def _advice(advised: "Advised") -> "Iterator[str | Table]":
-    from simtest.advice.advise import NOTHING, interval, sentence
-    from simtest.advice.plan import DISTANCES
+    from simtest.advice.advise import NOTHING, counts, interval, sentence
     from simtest.pages.style import number
 
-    rows = [
-        (m.estimator, m.target, f"{m.answered} of {m.asked}", number(m.fine.mean_deg), interval(m.fine.interval_deg),
-         number(m.base.mean_deg), interval(m.base.interval_deg))
-        for m in advised.answers.methods
-    ]  # fmt: skip
-    columns = ("method", "states", "answered", "error, fine", "95 % interval", "error, base", "95 % interval")
-    yield Table(columns, rows)
-    yield f"{advised.answers.frames} frames, {advised.question.per_distance} at each of {DISTANCES} distances"
+    rows = []
+    for m in advised.answers.methods:
+        beside = advised.answers.beside(m.estimator)
+        difference = f"{number(beside.mean_deg)} ({beside.highlights})" if beside else "–"
+        rows.append((m.estimator, m.target, f"{m.answered} of {m.asked}", number(m.fine.mean_deg),
+                     interval(m.fine.interval_deg), number(m.base.mean_deg), interval(m.base.interval_deg),
+                     difference))  # fmt: skip
+    columns = ("method", "states", "answered", "error, fine", "95 % interval", "error, base", "95 % interval",
+               "minus the first's")  # fmt: skip
+    yield Table(columns, rows, width=140)
+    yield counts(advised.answers)
     breaks = [
         (b.title, b.method, f"{b.quantity} {number(b.value)} {b.unit}".strip(),
          "refuses" if b.expected is None else number(b.expected))

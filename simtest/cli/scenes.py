@@ -48,13 +48,15 @@ def render(
     and lobe, as far as the scene says that they are known; `simtest reconstruct --camera` reads it.
     """
     from simtest import api
+    from simtest.simulation.highlights import NO_HIGHLIGHT, REMEDIES
 
     out = out or Path("reports/frames") / Path(scene).stem
     with exclusive_folder(out):
         with progress_bar("finding the truth", stopped="nothing is written") as move:
             frame = api.render(scene, values_of(settings), variant, move)
         files = frame.write(out)
-    return Told(files, {"highlights": len(frame.highlights)})
+    lines = [] if frame.highlights else [f"{NO_HIGHLIGHT}: {REMEDIES[NO_HIGHLIGHT]}"]
+    return Told(files, {"highlights": len(frame.highlights)}, lines)
 
 
 @command
@@ -81,6 +83,8 @@ def views(
     With --along, a film along the camera path instead. The poses are written for other programs, too.
     """
     from simtest import api
+    from simtest.spec import load_scene
+    from simtest.validation.mesh_verdicts import verdicts_of
 
     ends = None if along is None else _ends(along)
     with progress_bar("sampling views") as move:
@@ -90,8 +94,12 @@ def views(
     lines = [
         f"{with_one} of {sampled.tried} views show an isolated highlight",
         *(f"left out: {number} ({reason})" for reason, number in sampled.rejected.items()),
+        *([f"to find more: {sampled.remedy}"] if sampled.remedy else []),
         *(f"not written: {reason}" for reason in sampled.poses_left_out),
     ]
+    if with_one <= sampled.tried / 2:
+        # A coarse mesh shows highlights that are not the surface's.
+        lines += map(str, verdicts_of([load_scene(scene, values_of(settings))]))
     return Told([out / "views.json"], counts | {"left_out": sampled.rejected}, lines)
 
 

@@ -29,14 +29,14 @@ from simtest.spec.recipes import Distribution
 CARD = "README.md"
 
 
-def write_card(plan: Plan, manifest: Manifest, folder: Path) -> None:
+def write_card(plan: Plan, manifest: Manifest, lacking: str, folder: Path) -> None:
     """Write the card."""
-    text = make_card(plan, manifest)
+    text = make_card(plan, manifest, lacking)
     write_atomically(folder / CARD, lambda part: part.write_text(text, encoding="utf-8"))
 
 
-def make_card(plan: Plan, manifest: Manifest) -> str:
-    """Return the card's text, which depends on the dataset alone."""
+def make_card(plan: Plan, manifest: Manifest, lacking: str = "") -> str:
+    """Return the card's text, which depends on the dataset alone; `lacking` is its `shortfall`."""
     dataset = plan.dataset
     # samples and shards of each split
     counts: dict[str, list[int]] = {name: [0, 0] for name in plan.splits}
@@ -53,6 +53,7 @@ def make_card(plan: Plan, manifest: Manifest) -> str:
         dataset=dataset,
         counts=counts,
         made_small=plan.made_small,
+        lacking=lacking,
         fields=plan.fields,
         has_relief=plan.has_relief,
         has_instruments=plan.has_instruments,

@@ -11,6 +11,7 @@ from simtest.dataset.metadata import HighlightMeta, SampleMeta
 from simtest.dataset.plan import Plan, Shard
 from simtest.dataset.shard import PART, samples
 from simtest.runtime.files import write_parquet
+from simtest.simulation.highlights import NO_HIGHLIGHT, REMEDIES
 from simtest.validation.columns import COLUMNS, NUMBER, TEXT, WHOLE, YES_NO, Column, Row, Value
 
 SAMPLES, HIGHLIGHTS, ESTIMATES = "index.parquet", "highlights.parquet", "estimates.parquet"
@@ -146,10 +147,12 @@ def write_shard_tables(plan: Plan, folder: Path, shard: Shard) -> None:
         write_parquet(_part(folder, shard, name), table)
 
 
-def write_tables(plan: Plan, folder: Path) -> None:
-    """Write the tables, from the rows that workers have written or else from the shards."""
-    for name, table in _joined(_written(plan, folder, shard) for shard in plan.shards).items():
+def write_tables(plan: Plan, folder: Path) -> dict[str, pl.DataFrame]:
+    """Write the tables, from the rows that workers have written or else from the shards; return them."""
+    tables = _joined(_written(plan, folder, shard) for shard in plan.shards)
+    for name, table in tables.items():
         write_parquet(folder / name, table)
+    return tables
 
 
 def _written(plan: Plan, folder: Path, shard: Shard) -> dict[str, pl.DataFrame]:
@@ -158,6 +161,41 @@ def _written(plan: Plan, folder: Path, shard: Shard) -> dict[str, pl.DataFrame]:
         return {name: pl.read_parquet(_part(folder, shard, name)) for name in TABLES}
     except (OSError, pl.exceptions.PolarsError):
         return shard_tables(plan, folder, shard)
+
+
+JUDGED = {SAMPLES: ["index", "n_highlights", "n_isolated"], HIGHLIGHTS: ["index", "isolated", "why_not", "peak_snr"]}
+"""Columns that `shortfall` needs."""
+
+
+def shortfall(plan: Plan, tables: Mapping[str, pl.DataFrame]) -> str:
+    """Return how many samples show too few isolated highlights, why, and what to change; empty where none does.
+
+    A recipe that takes every frame is told where most show no highlight at all.
+    """
+    dataset, samples = plan.dataset, tables[SAMPLES]
+    few = samples.filter(
+        pl.col("n_isolated") < dataset.highlights if dataset.highlights else pl.col("n_highlights") == 0
+    )
+    if few.is_empty() or (not dataset.highlights and few.height <= samples.height / 2):
+        return ""
+    # That of the highlight which stands out most, as in `simtest views`.
+    others = tables[HIGHLIGHTS].filter(~pl.col("isolated")).sort("peak_snr", descending=True, nulls_last=True)
+    reasons = few.join(others.unique("index", keep="first", maintain_order=True), on="index", how="left")
+    counts = (
+        reasons["why_not"].fill_null(NO_HIGHLIGHT).value_counts().sort("count", "why_not", descending=[True, False])
+    )
+    text = f"{few.height} of {samples.height} samples show "
+    if dataset.highlights:
+        text += f"fewer isolated highlights than highlights = {dataset.highlights} asks for; the last of "
+        text += f"tries = {dataset.tries} draws was taken"
+    else:
+        text += "no highlight"
+    text += f" ({', '.join(f'{count}: {reason}' for reason, count in counts.iter_rows())})"
+    if remedy := REMEDIES.get(counts["why_not"][0]):
+        text += f"; {remedy}"
+    if meshes := [path.name for path in plan.inputs if path.suffix != ".toml"]:
+        text += f"; `simtest mesh check` says whether {', '.join(meshes)} is fine enough"
+    return text
 
 
 def _part(folder: Path, shard: Shard, name: str) -> Path:

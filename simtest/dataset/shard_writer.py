@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO
 
 from simtest.dataset.card import CARD, write_card
-from simtest.dataset.index import SAMPLES, TABLES, write_shard_tables, write_tables
+from simtest.dataset.index import JUDGED, TABLES, shortfall, write_shard_tables, write_tables
 from simtest.dataset.maker import Maker
 from simtest.dataset.manifest import (
     NAME,
@@ -78,7 +78,7 @@ def write_dataset(
     Warns
     -----
     UserWarning
-        Of samples that show fewer isolated highlights than the recipe asks for, with their number.
+        Of samples that show fewer isolated highlights than the recipe asks for, with their number and the reasons.
     """
     plan = Plan(dataset)
     if plan.made_small:
@@ -88,13 +88,9 @@ def write_dataset(
     with _telling_what_stays(folder), exclusive_folder(folder):
         manifest = _open(folder, plan, colour_variant(variant))
         _complete(plan, manifest, folder, engine, progress)
-        isolated = read_table(folder / SAMPLES, ["n_isolated"])["n_isolated"]
-    if few := int((isolated < dataset.highlights).sum()):
-        warnings.warn(
-            f"{few} of {len(isolated)} samples show fewer isolated highlights than highlights = {dataset.highlights} "
-            f"asks for; the last of tries = {dataset.tries} draws was taken",
-            stacklevel=2,
-        )
+        tables = {name: read_table(folder / name, columns) for name, columns in JUDGED.items()}
+    if few := shortfall(plan, tables):
+        warnings.warn(few, stacklevel=2)
     return manifest
 
 
@@ -124,8 +120,7 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
     _write_shards(plan, manifest, folder, engine.run(write_shard, tasks, step), missing)
     # tables and card, of all shards
     if not manifest.tables or not all((folder / name).exists() for name in manifest.tables):
-        write_tables(plan, folder)
-        write_card(plan, manifest, folder)
+        write_card(plan, manifest, shortfall(plan, write_tables(plan, folder)), folder)
         manifest.tables = {name: file_entry(folder / name) for name in (*TABLES, CARD)}
         manifest.save(folder)
     # rows of single shards, and parts of interrupted runs

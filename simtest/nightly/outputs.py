@@ -70,7 +70,7 @@ def summary(judged: JudgedRun) -> str:
     counts = OUTCOMES if verdict.baseline is not None else ()
     columns = ("experiment", "rows", "answered", "missed", "false", *counts)
     parts = [
-        f"## Nightly {escaped(record.profile)}: {headline(verdict)}",
+        f"## Nightly {escaped(record.profile)}: {escaped(headline(verdict))}",
         *(["\n".join(causes)] if causes else []),
         _compared(verdict),
         *(["\n".join(notes)] if notes else []),

@@ -82,17 +82,17 @@ def interval(low: float | None, high: float | None) -> str:
 
 
 def headline(verdict: Verdict) -> str:
-    """Return the verdict in a few words."""
+    """Return the verdict in a few words, with the estimators to blame and the experiments that show it."""
     worse, other = verdict.regressions.height, verdict.unexplained.height
     if verdict.state == "regression":
-        return f"regression: {worse} figure{'s' * (worse != 1)} worse"
+        return f"regression: {worse} figure{'s' * (worse != 1)} worse{_blamed(verdict.regressions)}"
     if verdict.state == "changed":
-        return f"changed: {other} figure{'s' * (other != 1)} to explain"
+        return f"changed: {other} figure{'s' * (other != 1)} to explain{_blamed(verdict.unexplained)}"
     return "fine, bit-equal" if verdict.state == "fine" and verdict.bit_equal else verdict.state
 
 
 def headline_sentence(verdict: Verdict) -> str:
-    """Return the verdict in a sentence, with the estimators to blame."""
+    """Return the verdict in a sentence, with the estimators to blame and the experiments that show it."""
     if verdict.state == "changed":
         found = verdict.unexplained
         verb = "has" if found.height == 1 else "have"
@@ -111,11 +111,16 @@ def headline_sentence(verdict: Verdict) -> str:
 
 
 def _blamed(found: pl.DataFrame) -> str:
-    """Return the estimators of findings with their numbers, after a colon; nothing where none is named."""
-    named = found["estimator"].replace("", None).drop_nulls()
-    counted = named.value_counts().sort("count", "estimator", descending=[True, False])
-    names = [f"{name} ({count})" for name, count in counted.iter_rows()]
-    return f": {labelled(names)}" if names else ""
+    """Return the estimators and experiments of findings with their numbers, after a colon; nothing where none is."""
+    # Rows over several of them name none.
+    parts = [_counted(found[key].replace(["", POOLED], None)) for key in ("estimator", "experiment")]
+    text = " in ".join(filter(None, parts))
+    return f": {text}" if text else ""
+
+
+def _counted(names: pl.Series) -> str:
+    counts = names.drop_nulls().value_counts().sort("count", names.name, descending=[True, False])
+    return labelled([f"{name} ({count})" for name, count in counts.iter_rows()])
 
 
 def verdict_lines(verdict: Verdict) -> list[tuple[str, str]]:

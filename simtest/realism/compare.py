@@ -291,7 +291,7 @@ def compare(
     real: Sequence[NamedFrame], generated: Sequence[NamedFrame], progress: Progress | None = None, seed: int = 0
 ) -> Comparison:
     """Measure both sets and compare them; frames that cannot be measured are left out with their reason."""
-    total, done = len(real) + len(generated) + 1, 0
+    total, done = len(real) + len(generated), 0
     left_out: list[LeftOut] = []
     sides = []
     names: tuple[Side, Side] = ("real", "generated")
@@ -316,11 +316,8 @@ def compare(
         bare = sum(not values["per_frame"].any() for _, values in measured)
         sides.append(SetOfFrames(by_scene(measured), len(measured), bare, pictures))
     if progress:
-        progress(done, total, "comparing the distributions")
-    found = Comparison(sides[0], sides[1], distances(sides[0].scenes, sides[1].scenes, seed), left_out)
-    if progress:
-        progress(total, total, "compared")
-    return found
+        progress(total, total, "comparing the distributions")
+    return Comparison(sides[0], sides[1], distances(sides[0].scenes, sides[1].scenes, seed), left_out)
 
 
 def small(picture: Image, height: int) -> Picture:

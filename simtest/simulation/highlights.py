@@ -41,6 +41,24 @@ DARK = 1e-6
 REACH_PX = 4.0
 """A descent that ends farther than this from all highlight points of the base belongs to none in view."""
 
+NO_HIGHLIGHT = "no highlight in view"
+SEVERAL = "holds several glints"
+STREAK = f"min abs(1 + d k) at most {HIGHLIGHT_MIN_GAIN:g}"
+LEAVES_FRAME = "isophote at t = 0.5 leaves the frame"
+FAINT = f"peak below {HIGHLIGHT_CONTRAST_SIGMA:g} sigma"
+"""Why a frame shows no isolated highlight, most often (theory.md section 6)."""
+
+REMEDIES = {
+    NO_HIGHLIGHT: "no normal in view is half-way between light and camera; look at a wall from beside the "
+    "axis (in a lumen surface.view = off_axis, surface.look_ahead_mm = 5), or take a wider field of view",
+    SEVERAL: "take a smoother relief (surface.relief) or a camera nearer to the wall",
+    STREAK: "the wall bends about the camera; look at it from beside the axis (in a lumen surface.view = off_axis, "
+    "surface.look_ahead_mm = 5)",
+    LEAVES_FRAME: "take a narrower lobe (a larger reflectance.exponent, a smaller alpha) or a wider field of view",
+    FAINT: "take less noise (sensor.noise_sigma) or a stronger lobe",
+}
+"""What to change where most frames show none for that reason."""
+
 Pixel = tuple[int, int]
 """Row and column."""
 
@@ -227,7 +245,7 @@ def verdicts(
         snr = 0.0
         if each.height is not None:
             snr = _snr(min(each.level, clip) - min(each.level - each.height, clip), sigma)
-        faint = f"peak below {HIGHLIGHT_CONTRAST_SIGMA:g} sigma" if snr < HIGHLIGHT_CONTRAST_SIGMA else ""
+        faint = FAINT if snr < HIGHLIGHT_CONTRAST_SIGMA else ""
         highlights.append(TrueHighlight(**vars(point), peak_snr=snr, why_not=each.why_not or faint))
     return highlights
 
@@ -235,6 +253,11 @@ def verdicts(
 def _snr(height: float, sigma: float) -> float:
     """Return a height over the noise, 0 without both."""
     return height / sigma if sigma > 0 else math.inf if height > 0 else 0.0
+
+
+def why_none(highlights: Sequence[TrueHighlight]) -> str:
+    """Return why a frame has no isolated highlight: the reason of the one that stands out most."""
+    return max(highlights, key=lambda each: each.peak_snr).why_not if highlights else NO_HIGHLIGHT
 
 
 def lobe_region(point: HighlightPoint, specular: Image, at_point: float) -> tuple[float, Component | None]:
@@ -281,11 +304,11 @@ def _examined(
     # Shape, frame, noise: in the order of theory.md section 6.
     why_not = ""
     if component.holds(others).any():
-        why_not = "holds several glints"
+        why_not = SEVERAL
     elif point.min_gain <= HIGHLIGHT_MIN_GAIN:
-        why_not = f"min abs(1 + d k) at most {HIGHLIGHT_MIN_GAIN:g}"
+        why_not = STREAK
     elif not component.closed:
-        why_not = "isophote at t = 0.5 leaves the frame"
+        why_not = LEAVES_FRAME
     return Examined(peak, level, contrast(smoothed, component, level, seen), why_not, component)
 
 

@@ -21,12 +21,13 @@ from simtest.runtime.files import Json, write_atomically, write_json
 from simtest.simulation import sequences
 from simtest.simulation.frame import RenderedView, render_view
 from simtest.simulation.frame_files import encoded_png, thumbnail, write_sheet
+from simtest.simulation.highlights import REMEDIES, why_none
 from simtest.simulation.sensor import to_uint8
 from simtest.spec import AnatomySurface, Scene
 from simtest.spec.camera_formats.trajectories import COLMAP, TRANSFORMS, TUM, Trajectory, stack, write_trajectory
 from simtest.surfaces import make_surface
 
-NO_HIGHLIGHT, NO_ROOM = "no highlight in view", "no room for the camera, a light or an instrument"
+NO_ROOM = "no room for the camera, a light or an instrument"
 
 GOLDEN_SHARE = 0.6180339887498949
 """Multiples of it, modulo 1, cover [0, 1) evenly at any number of them."""
@@ -92,6 +93,14 @@ class SampledViews:
     def tried(self) -> int:
         """How many viewpoints were tried."""
         return len(self.views) + sum(self.rejected.values())
+
+    @property
+    def remedy(self) -> str:
+        """What to change where most views show no isolated highlight, for the most frequent reason; else empty."""
+        if sum(view.isolated_highlights > 0 for view in self.views) > self.tried / 2 or not self.rejected:
+            return ""
+        # The most frequent reason is the first.
+        return REMEDIES.get(next(iter(self.rejected)), "")
 
 
 def sample_into(
@@ -167,9 +176,9 @@ def sample_views(
                 picture, seed = write(session, view) if write else (None, None)
                 kept.append(SampledView(viewpoint, view.isolated, pose, picture, seed, time))
             else:
-                rejected[_reason(view)] += 1
+                rejected[why_none(view.highlights)] += 1
         if progress:
-            progress(len(kept), count, f"{key} = {viewpoint:g}")
+            progress(len(kept), count, f"views kept, tried {key} = {viewpoint:g}")
         if len(kept) == count:
             break
     if first_error is not None and not kept and set(rejected) == {NO_ROOM}:
@@ -198,13 +207,6 @@ def viewpoint_key(scene: Scene) -> str:
     if not isinstance(scene.surface, AnatomySurface):
         raise InputError(f"surface.type = {scene.surface.type}: views are sampled of an anatomy only")
     return "surface.viewpoint" if scene.surface.view == "auto" else "surface.path_share"
-
-
-def _reason(view: RenderedView) -> str:
-    """Return why a view has no isolated highlight: the reason of the highlight that stands out most."""
-    if not view.highlights:
-        return NO_HIGHLIGHT
-    return max(view.highlights, key=lambda highlight: highlight.peak_snr).why_not
 
 
 class ViewWriter:

@@ -1,7 +1,7 @@
 """What `simtest mesh check` says of the mesh files that an experiment runs on."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,14 +33,20 @@ class MeshVerdict(BaseModel):
 
 
 def mesh_verdicts(experiment: Experiment) -> list[MeshVerdict]:
-    """Judge each mesh file of an experiment once; recipes are fine by construction.
+    """Judge each mesh file of an experiment once (`verdicts_of`)."""
+    return verdicts_of(scene for group in experiment.groups for scene in _scenes(group))
 
-    A file has several verdicts only where groups of other lobes or refinements are judged otherwise.
+
+def verdicts_of(scenes: Iterable[Scene]) -> list[MeshVerdict]:
+    """Judge each mesh file of scenes once; recipes are fine by construction.
+
+    A file has several verdicts only where scenes of other lobes or refinements are judged otherwise.
     """
     verdicts: dict[tuple[object, ...], MeshVerdict] = {}
-    for scene in (scene for group in experiment.groups for scene in _scenes(group)):
+    for scene in scenes:
         surface = scene.surface
-        assert isinstance(surface, AnatomySurface)
+        if not isinstance(surface, AnatomySurface) or surface.file().suffix.lower() == ".toml":
+            continue
         # A lobe without a closed form counts as the Gaussian that is as wide at half its height.
         lobe = scene.reflectance.lobe_curvature or 2 * math.log(2) / scene.reflectance.half_width**2
         key = (surface.file(), surface.kind, surface.edge_mm, lobe)
@@ -58,9 +64,7 @@ def _scenes(group: Group) -> Iterator[Scene]:
     own: list[Any] = [surface.get("path")] if isinstance(surface, dict) else []
     for name in dict.fromkeys(own if not swept else (value for values in swept for value in values)):
         if isinstance(name, str) and Path(name).suffix.lower() not in ("", ".toml"):
-            scene = scene_from_dict(apply_settings(base, {"surface.path": name}, str(path)), str(path))
-            if isinstance(scene.surface, AnatomySurface):
-                yield scene
+            yield scene_from_dict(apply_settings(base, {"surface.path": name}, str(path)), str(path))
 
 
 def _judge(surface: AnatomySurface, lobe: float) -> MeshVerdict:

@@ -11,7 +11,7 @@ import pytest
 
 import simtest
 from simtest.advice import plan
-from simtest.advice.advise import MAIN, RUN, advise, narrower, sentence, write_advice, write_scene
+from simtest.advice.advise import MAIN, RUN, advise, counts, narrower, sentence, write_advice, write_scene
 from simtest.advice.answers import break_points, mean_error, read_results, spot_size
 from simtest.advice.plan import (
     DISTANCES,
@@ -332,6 +332,39 @@ def test_figures_of_known_errors():
     assert set(found.choices[0].by_distance) == {20.0, 30.0}
 
 
+def test_the_recommended_method_is_the_first_row_and_a_smaller_mean_is_explained():
+    """`curved` refuses the two walls on which all others err by 90 deg, and errs more elsewhere."""
+    frames = [frame for frame in range(8) for _ in range(2)]
+    errors = [2.0 + 0.1 * (i % 5) for i in range(14)] + [90.0, 90.0]
+    cone = results(errors, frames)
+    curved = results([error + 0.4 for error in errors], frames, ["ok"] * 14 + ["degenerate_conic"] * 2)
+    rows = pl.concat([curved.with_columns(estimator=pl.lit("curved")), cone])
+    found = read_results(rows, 8, 2)
+    assert found.choices[0].best == "cone_axis"
+    assert [method.estimator for method in found.methods] == ["cone_axis", "curved"]
+    assert found.method("curved").fine.mean_deg < found.method("cone_axis").fine.mean_deg
+    beside = found.beside("curved")
+    assert (beside.mean_deg, beside.highlights) == (pytest.approx(0.4), 14)
+    assert found.beside("cone_axis") is None
+    said = sentence(SimpleNamespace(answers=found), found.choices[0])
+    assert (
+        "curved has a smaller mean, 2.59 deg, over its 14 answers: over the 14 that both answered its error is" in said
+    )
+    assert "0.4 deg larger." in said
+
+
+def test_the_counts_of_detections_add_up_and_are_said():
+    rows = results([1.0] * 6, [0, 0, 1, 1, 2, 3]).with_columns(
+        true_id=pl.Series([0, 1, 2, 3, None, None]), visible_id=pl.Series([0, 1, 2, 3, 4, None])
+    )
+    found = read_results(rows, 4, 2)
+    assert (found.found, found.matched, found.unmatched, found.false) == (5, 4, 1, 1)
+    assert found.matched + found.unmatched + found.false == found.detections
+    assert counts(found).startswith(
+        "4 frames show 40 visible highlights; the detector found 5 of them. Its 6 detections: 4 at"
+    )
+
+
 def test_distances_without_a_highlight_do_not_add_frames_to_the_others():
     """Of 80 frames 10 are at each distance, also where six of the eight distances have no row."""
     rows = results([1.0, 3.0, 2.0, 2.0, 4.0, 6.0, 1.5, 1.2], [0, 0, 1, 1, 2, 3, 4, 5])
@@ -458,6 +491,7 @@ def test_every_figure_runs_again_and_the_page_prints_how(tmp_path):
     record = json.loads((out / "advice.json").read_text(encoding="utf-8"))
     for command in record["commands"].values():
         assert command in page
+    assert counts(found.answers) in page
     # The command of the errors, with another folder: the same rows, so the same figures.
     run = simtest.validate(out / MAIN, tmp_path / "again")
     again = read_results(run.results, 8)

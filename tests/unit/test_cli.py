@@ -36,6 +36,7 @@ from simtest.rendering.backend import BackendReport
 from simtest.runtime import messages
 from simtest.runtime.boundary import suggestion
 from simtest.runtime.resources import OWN
+from simtest.simulation.highlights import NO_HIGHLIGHT, REMEDIES
 from simtest.spec import load_dataset, load_experiment, load_profile, load_scene
 from simtest.validation import runner
 
@@ -291,6 +292,12 @@ def test_export_writes_what_mitsuba_loads(here, tmp_path):
     assert (code, output, len(errors)) == (2, "", 1)
     assert "camera.skew = 1.0: cannot be exported" in errors[0]
     assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.render
+def test_a_frame_without_a_highlight_says_what_to_change(here, tmp_path):
+    code, output, _ = here("render", "plane", *SET_SMALL, "--set", "surface.tilt_deg=60", "--out", tmp_path / "x")
+    assert (code, output.splitlines()[0]) == (0, f"{NO_HIGHLIGHT}: {REMEDIES[NO_HIGHLIGHT]}")
 
 
 @pytest.mark.render

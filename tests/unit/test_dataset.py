@@ -3,9 +3,11 @@
 import hashlib
 import json
 import re
+import shlex
 import shutil
 import tarfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -18,8 +20,8 @@ from hypothesis import strategies as st
 import simtest
 from simtest.cli.main import main
 from simtest.dataset import calibration_of, fields, png, read
-from simtest.dataset.card import make_card, write_preview
-from simtest.dataset.index import TABLES, write_shard_tables, write_tables
+from simtest.dataset.card import CARD, make_card, write_preview
+from simtest.dataset.index import TABLES, shortfall, write_shard_tables, write_tables
 from simtest.dataset.maker import Maker, _share_of
 from simtest.dataset.manifest import NAME, FileEntry, Manifest, _digest, file_entry, new_manifest, read_manifest
 from simtest.dataset.plan import Plan, _draw
@@ -30,6 +32,7 @@ from simtest.errors import InputError, SimtestError
 from simtest.pages.markdown import escaped, yaml_string
 from simtest.runtime.processes import cores_per_task, make_engine
 from simtest.simulation.frame_files import write_frame
+from simtest.simulation.highlights import FAINT, NO_HIGHLIGHT, REMEDIES, STREAK
 from simtest.spec import load_dataset, load_scene, scene_from_dict
 from simtest.spec.recipes import Dataset, Distribution, Splits
 from simtest.spec.spec_model import validate
@@ -852,6 +855,14 @@ def test_commands(made, tmp_path, monkeypatch, capsys):
     assert run("verify", "made") == (0, ["sound"])
     code, said = run("sample", "made", "2")
     assert (code, said[-1].partition(": ")[2]) == (0, "same bytes")
+    # The command that it prints renders the sample's frame.
+    monkeypatch.setattr("sys.argv", [*shlex.split(said[-2].partition(": ")[2]), "--out", "again"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    capsys.readouterr()
+    frames = (cv2.imread(str(tmp_path / name)) for name in ("sample-2/000000002.image.png", "again/frame.png"))
+    np.testing.assert_array_equal(*frames)
     assert run("preview", "made", "--samples", "3") == (0, ["preview.html"])
     page = (tmp_path / "preview.html").read_text()
     assert page.count('<section class="card">') == 3
@@ -872,8 +883,31 @@ def test_samples_below_the_recipes_number_of_highlights_are_counted(tmp_path):
     values = {"name": "few", "samples": 3, "samples_per_anatomy": 1, "tries": 3, "families": families}
     split = {"train": 1, "validation": 0, "test": 0}
     dataset = validate(Dataset, {**values, "splits": split, "estimators": ["cone_axis"]}, "few")
-    with pytest.warns(UserWarning, match=r"^2 of 3 samples show fewer isolated highlights than highlights = 1 asks"):
+    with pytest.warns(UserWarning, match=r"^2 of 3 samples show fewer isolated highlights than highlights = 1") as told:
         write_dataset(dataset, tmp_path / "few", make_engine())
+    # Why, and what to change; the card says the same.
+    said = str(told[0].message)
+    assert "(2: no highlight in view); no normal in view is half-way" in said
+    assert escaped(said, 1000) + "." in (tmp_path / "few" / CARD).read_text(encoding="utf-8")
+    assert verify(tmp_path / "few") == []
+
+
+def test_why_samples_show_too_few_highlights_is_that_of_the_highlight_that_stands_out_most():
+    samples = pl.DataFrame({"index": [0, 1, 2, 3], "n_highlights": [2, 1, 0, 1], "n_isolated": [0, 0, 0, 1]})
+    rows = [(0, False, FAINT, 3.0), (0, False, STREAK, 40.0), (1, False, STREAK, 20.0), (3, True, None, 50.0)]
+    highlights = pl.DataFrame(rows, schema=["index", "isolated", "why_not", "peak_snr"], orient="row")
+    dataset = SimpleNamespace(highlights=1, tries=8)
+    plan = SimpleNamespace(dataset=dataset, inputs=[Path("tube.toml"), Path("tube.obj")])
+    said = shortfall(plan, {INDEX: samples, HIGHLIGHTS: highlights})
+    assert f"(2: {STREAK}, 1: {NO_HIGHLIGHT}); {REMEDIES[STREAK]}; `simtest mesh check` says whether tube.obj" in said
+    assert not shortfall(plan, {INDEX: samples[3:], HIGHLIGHTS: highlights})
+    # A recipe that takes every frame is told where most of them show no highlight at all.
+    dataset.highlights = 0
+    assert not shortfall(plan, {INDEX: samples, HIGHLIGHTS: highlights})
+    none = samples.with_columns(n_highlights=pl.Series([0, 0, 0, 1]))
+    assert shortfall(plan, {INDEX: none, HIGHLIGHTS: highlights[3:]}).startswith(
+        f"3 of 4 samples show no highlight (3: {NO_HIGHLIGHT}); "
+    )
 
 
 def test_a_samples_metadata_are_a_scene_that_is_rendered_again(made, tmp_path):

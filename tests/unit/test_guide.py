@@ -193,6 +193,18 @@ def test_a_surface_with_relief_is_named_by_its_base(base, surface):
     assert guide_from(tissue).advice[0].situation.surface == "colon: mixed curvature"
 
 
+def test_no_median_of_a_situation_is_above_the_largest_of_its_settings():
+    """Settings of unlike sizes and skews, with frames that repeat each other, as without noise."""
+    rng = np.random.default_rng(3)
+    for _ in range(30):
+        drawn = [rng.lognormal(-3, rng.uniform(0.01, 2), rng.integers(1, 8)).tolist() for _ in range(3)]
+        drawn[0] = [drawn[0][0]] * len(drawn[0])
+        (advice,) = guide_from(
+            *(rows_of("cone_axis", own, name) for name, own in zip("abc", drawn, strict=True))
+        ).advice
+        assert advice.methods["cone_axis"].median_deg <= advice.by_setting[advice.worst].median_deg
+
+
 BREAKS = [
     ({"a": [1.0] * 4, "b": [2.0] * 4}, "nowhere here (largest median: 2°, at b)", False),
     ({"a": [1.0] * 4, "b": [6.0] * 4}, "1 of 2 settings, b: mean 6°", True),

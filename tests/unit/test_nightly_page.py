@@ -329,7 +329,8 @@ def test_json_bears_figures_that_are_not_finite(tmp_path, small):
 
 def test_the_summary_says_first_what_matters(small):
     lines = summary(judged(small, regression(small, notes=["Versions differ."]))).splitlines()
-    assert lines[0] == "## Nightly quick: regression: 2 figures worse"
+    # The terminal's line is the same.
+    assert lines[0] == "## Nightly quick: regression: 2 figures worse: cone_axis (2) in first (1) and second (1)"
     assert lines[2].startswith('Not bit-equal to the baseline of 2026-03-01T02:30:00+00:00, commit 0123456789ab+: "fir')
     titles = [line for line in lines if line.startswith("#")]
     assert titles[1:] == ["### Worse: 2", "### Better: 2", "### By experiment"]
@@ -376,6 +377,7 @@ def test_causes_stand_first(small):
     cause = "cone_axis in first, plane: the law is 6 deg, was 1 deg."
     verdict = replace(regression(small, outcomes=("changed", "same")), state="changed", causes=(cause,))
     text = summary(judged(small, verdict))
-    assert text.splitlines()[0] == f"## Nightly quick: changed: {verdict.unexplained.height} figures to explain"
+    said = f"changed: {verdict.unexplained.height} figures to explain: cone_axis (4) in first (2) and second (2)"
+    assert text.splitlines()[0] == f"## Nightly quick: {said}"
     assert text.splitlines()[2] == f"- {cause}"
     assert "### Changed, to be explained" in text

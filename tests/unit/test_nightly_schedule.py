@@ -32,6 +32,14 @@ def test_workflows_trust_little(path):
     assert text.count("timeout-minutes:") == text.count("runs-on:")
 
 
+def test_no_fork_runs_what_is_scheduled():
+    scheduled = [text for path in WORKFLOWS if "\n  schedule:\n" in (text := path.read_text())]
+    assert scheduled
+    guard = "if: ${{ github.event_name != 'schedule' || !github.event.repository.fork }}"
+    for text in scheduled:
+        assert text.count(f"    {guard}\n    runs-on:") == text.count("runs-on:")
+
+
 def test_one_action_has_one_version():
     pins = {}
     for path in WORKFLOWS:

@@ -12,7 +12,8 @@ from simtest.errors import InputError
 from simtest.reconstruction.poses import read_poses
 from simtest.rendering.placement_checks import check_lights
 from simtest.simulation.flow import STATES, Flow, flow_picture
-from simtest.simulation.views import NO_HIGHLIGHT, NO_ROOM, candidates, sample_views
+from simtest.simulation.highlights import NO_HIGHLIGHT, REMEDIES, STREAK
+from simtest.simulation.views import NO_ROOM, SampledView, SampledViews, candidates, sample_views
 from simtest.spec import load_scene
 from simtest.surfaces import make_surface
 
@@ -156,6 +157,7 @@ def test_every_place_is_either_kept_or_counted():
     scene, told = load_scene("anatomy", SMALL), []
     sampled = sample_views(scene, 3, range(12), progress=lambda *said: told.append(said))
     assert sampled.tried == len(told)
+    assert told[-1] == (3, 3, f"views kept, tried surface.viewpoint = {sampled.views[-1].viewpoint}")
     assert len(sampled.views) == 3
     assert min(view.isolated_highlights for view in sampled.views) >= 1
     assert sampled.tried == sampled.views[-1].viewpoint + 1
@@ -189,6 +191,16 @@ def test_a_place_without_room_for_the_light_is_counted_and_the_next_is_tried():
         sample_views(scene, 1, [without])
     with pytest.raises(InputError, match=r"surface\.viewpoint = \d+: .* touches the colon"):
         sample_views(scene, 1, [without, *free], fps=10.0)
+
+
+@pytest.mark.parametrize(
+    ("rejected", "said"),
+    [({NO_HIGHLIGHT: 79, STREAK: 15}, REMEDIES[NO_HIGHLIGHT]), ({STREAK: 3}, REMEDIES[STREAK]), ({STREAK: 2}, ""),
+     ({NO_ROOM: 9}, ""), ({}, "")],
+)  # fmt: skip
+def test_where_most_views_show_no_isolated_highlight_it_says_what_to_change(rejected, said):
+    views = [SampledView(number, 1, np.eye(4)) for number in range(3 if said or not rejected else 4)]
+    assert SampledViews(views, rejected).remedy == said
 
 
 @pytest.mark.render
