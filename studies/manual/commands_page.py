@@ -2,6 +2,8 @@
 
 import inspect
 import re
+import sys
+from unittest.mock import patch
 
 from cyclopts import App
 
@@ -59,7 +61,9 @@ def _further(path: list[str]) -> str:
 
 def commands_page() -> str:
     """Return the page as Markdown."""
-    made = APP.generate_docs(output_format="markdown", include_hidden=False)
+    # The usage of commands below others quotes the process's own arguments.
+    with patch.object(sys, "argv", ["simtest"]):
+        made = APP.generate_docs(output_format="markdown", include_hidden=False)
     # What stands before the first command is the program's own help: a list of the commands, which the site has.
     sections = re.split(r"^(?=#{2,} simtest )", made, flags=re.MULTILINE)[1:]
     return OPENING + "".join(_section(text) for text in sections)
