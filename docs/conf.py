@@ -35,6 +35,7 @@ napoleon_use_rtype = False
 html_theme = "furo"
 html_static_path = ["_static"]
 html_css_files = ["manual.css"]
+html_js_files = ["manual.js"]
 html_show_sphinx = False
 html_use_index = False
 html_copy_source = False

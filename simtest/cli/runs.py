@@ -3,6 +3,7 @@
 import itertools
 import json
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -157,6 +158,20 @@ def print_guide(run: Path, console: "Console | None" = None) -> None:
         console.print(part)
     for line in (*more, *map(escape, filter(None, (guide["shared"], guide.get("seen"))))):
         console.print(line)
+    _print_practice(console, guide.get("practice") or {"rows": ()}, table)
+
+
+def _print_practice(console: "Console", practice: "dict[str, Any]", table: Callable[[bool], Any]) -> None:
+    """Print what practice gives below a run's own rows, each command above the rows that it measures."""
+    from rich.markup import escape
+
+    for index, (measured_by, group) in enumerate(itertools.groupby(practice["rows"], lambda row: row["command"])):
+        if not index:
+            console.print(f"[bold]{escape(practice['title'])}[/bold]")
+        part = table(False)
+        for row in group:
+            part.add_row(*map(escape, (row["surface"], row["best"], *_figures(row))))
+        console.print(escape(measured_by), part, sep="\n")
 
 
 def _figures(row: "dict[str, Any]") -> tuple[str, str, str]:

@@ -1,7 +1,9 @@
 """The guide to a run's methods in words, for its page, for guide.json and for the terminal."""
 
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from simtest.estimators.names import is_own
@@ -47,6 +49,12 @@ WORDS = {
 }
 """Words of the situations and figures, explained."""
 
+PRACTICE = Path(__file__).parent / "practice.toml"
+"""What pictures from practice give, by the experiments beside whose figures it is shown."""
+
+MOST_ANSWERS = 8
+"""Lines of the page's first table; the table below it has them all."""
+
 
 @dataclass(frozen=True)
 class GuideRow:
@@ -88,7 +96,9 @@ class MethodRow:
     breaks: str
 
 
-def guide_content(guide: Guide, about: Mapping[str, str], frames: int | None = None) -> dict[str, Any]:
+def guide_content(
+    guide: Guide, about: Mapping[str, str], frames: int | None = None, experiment: str = ""
+) -> dict[str, Any]:
     """Return the content of guide.json: the rows in words, and the figures that they are made of.
 
     `about` describes the methods by name; `frames` is the number of the run's frames, where it is known.
@@ -108,7 +118,46 @@ def guide_content(guide: Guide, about: Mapping[str, str], frames: int | None = N
         "heads": HEADS, "rows": rows, "shared": shared_sentence(guide), "seen": seen_sentence(guide, frames),
         "left_out": guide.left_out,
         "methods": [vars(row) for row in method_rows(guide, about)], "rules": RULES, "words": WORDS,
+        "practice": practice(experiment),
     }  # fmt: skip
+
+
+def practice(experiment: str) -> dict[str, Any] | None:
+    """Return what practice gives beside an experiment's figures, its rows with the cells of a situation's row."""
+    measured = tomllib.loads(PRACTICE.read_text(encoding="utf-8"))
+    if experiment not in measured["experiments"]:
+        return None
+    rows = [
+        row | {
+            "unanswered": "",
+            "error": f"{row['median_deg']:g}°" + (f" (95 % below {row['p95_deg']:g}°)" if "p95_deg" in row else ""),
+            "breaks": f"95 % region of {row['region_deg']:g}°"
+            + (f", covers {row['covered_percent']} %" if "covered_percent" in row else ""),
+        }
+        for row in measured["rows"]
+    ]  # fmt: skip
+    return {"title": measured["title"], "about": measured["about"], "rows": rows}
+
+
+def answers(content: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return the lines of the page's first table: situations of one kind of light that have one best method."""
+    groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
+    for row in content["rows"]:
+        groups.setdefault((row["circumstances"], row["best"] or "", row["unranked"]), []).append(row)
+    lines = []
+    for (circumstances, best, unranked), rows in groups.items():
+        medians = [row["methods"][best]["median_deg"] for row in rows if best]
+        ends = dict.fromkeys(number(end, 2) for end in (min(medians), max(medians))) if medians else ()
+        broken = [row["surface"] for row in rows if row["is_broken"]]
+        surfaces = ", ".join(row["surface"] for row in rows)
+        notes = (surfaces if circumstances else "", unranked, f"breaks: {', '.join(broken)}" if broken else "")
+        lines.append(
+            {
+                "situation": circumstances or surfaces, "best": best, "error": " to ".join(ends) + "°" * bool(ends),
+                "note": "; ".join(filter(None, notes)),
+            }
+        )  # fmt: skip
+    return lines
 
 
 def _figures(figures: MethodFigures) -> dict[str, Any]:

@@ -11,14 +11,14 @@ from simtest.pages import style
 from simtest.pages.charts import embedded, packed
 from simtest.pages.html import environment
 from simtest.report import sentences
-from simtest.report.error_figures import heat_charts, heat_maps, line_chart, line_figures
+from simtest.report.error_figures import LineFigure, heat_charts, heat_maps, line_chart, line_figures
 from simtest.report.error_laws import is_tested, law_charts, law_colours, law_results, sentence
 from simtest.report.figure_files import THREADS, FigureFiles
 from simtest.report.gallery import Shown, draw_shown, file_name, isophote_keys
 from simtest.report.glint_figures import glint_figures
-from simtest.report.guide_text import guide_content
+from simtest.report.guide_text import MOST_ANSWERS, answers, guide_content
 from simtest.report.paper.paper_section import paper_section
-from simtest.report.relief_figures import motion_figures, relief_figures, visible_figures
+from simtest.report.relief_figures import ReliefFigure, motion_figures, relief_figures, visible_figures
 from simtest.report.run_folder import Run
 from simtest.report.scene3d import framed, kept_scene
 from simtest.report.tables import HEADINGS, coverage, pairs, surface_chart, surface_errors, table_rows
@@ -60,9 +60,9 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
     # Errors over one quantity and over two, and against their laws.
     figures.tell("comparing with the laws")
     curves = line_figures(run)
-    lines = [(curve, figures.draw(curve.key, [line_chart(curve, colours)])[0]) for curve in curves]
     relief = [*relief_figures(run, colours), *glint_figures(run), *visible_figures(run), *motion_figures(run)]
-    for each in relief:
+    shown = [*relief, *(_described(curve, colours) for curve in curves)]
+    for each in shown:
         figures.draw(each.chart.key, [each.chart])
     paper, results = paper_section(run, colours, figures), law_results(run)
     laws = figures.draw("laws", law_charts(results)) if is_tested(results) else []
@@ -80,7 +80,8 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
     return {
         "headline": headline, "paper": paper, "laws": laws, "law_results": results,
         "law_colours": law_colours(results),
-        "lines": [(curve, chart, sentences.measured(curve)) for curve, chart in lines], "relief": relief,
+        # The first one stands beside the answer, the others below it.
+        "lead": shown[0] if shown else None, "shown": shown[1:],
         "heat": [(chart, sentences.heat_line(item)) for chart, item in zip(heat, maps, strict=True)],
         "surfaces": surfaces, "boxes": boxes,
         "coverage": coverage(run),
@@ -90,16 +91,26 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _described(curve: LineFigure, colours: Mapping[str, str]) -> ReliefFigure:
+    """Return a figure of curves with its sentences."""
+    caption = "Points are means over the realisations of a setting, bars their 95 % interval (over frames); dashes are "
+    caption += "the law, which knows no noise."
+    if curve.binned:
+        caption += " Where one setting holds many highlights, points are bins of highlights."
+    return ReliefFigure(line_chart(curve, colours), curve.about, tuple(sentences.measured(curve)), caption)
+
+
 def guide_json(run: Run) -> dict[str, Any]:
     """Return the content of guide.json: which method to use, and where each breaks."""
-    return guide_content(run.guide, DESCRIPTIONS | run.summary.estimators, run.summary.frames)
+    return guide_content(run.guide, DESCRIPTIONS | run.summary.estimators, run.summary.frames, run.experiment)
 
 
 def _guide(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the guide's template needs of guide.json."""
     groups = itertools.groupby(content["rows"], lambda row: row["circumstances"])
     # Under a name of its own: a template's `methods` would be anyone's.
-    return {"guide": {**content, "groups": [(circumstances, list(rows)) for circumstances, rows in groups]}}
+    guide = {**content, "groups": [(circumstances, list(rows)) for circumstances, rows in groups]}
+    return {"guide": guide, "answers": answers(content), "most_answers": MOST_ANSWERS}
 
 
 def _draw_frame(figures: FigureFiles, index: int, item: KeptItem, colours: Mapping[str, str]) -> Shown:

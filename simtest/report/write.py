@@ -15,7 +15,7 @@ GUIDE = "guide.json"
 
 _OPEN, _CLOSE = "<!-- made of ", " -->\n"
 _PACKAGE = Path(__file__).resolve().parents[1]
-_TEMPLATES = ("*.j2", "*.json")
+_TEMPLATES = ("*.j2", "*.json", "*.toml")
 # Whose versions change a page, beside those that change results.
 _DRAWING = ("pillow", "jinja2", "matplotlib", "trimesh", "vl-convert-python")
 

@@ -3,6 +3,7 @@
 import io
 import json
 from itertools import groupby
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -12,7 +13,7 @@ from test_report import make_run
 
 from simtest.estimators.names import DESCRIPTIONS
 from simtest.report import write_report
-from simtest.report.guide_text import guide_rows, method_rows, seen_sentence
+from simtest.report.guide_text import answers, guide_content, guide_rows, method_rows, practice, seen_sentence
 from simtest.report.run_folder import read_run
 from simtest.report.tables import pairs
 from simtest.runtime.statistics import median_interval
@@ -27,6 +28,7 @@ from simtest.validation.guide import guide_of
 from simtest.validation.run_summary import summarise_run
 from simtest.validation.situations import conditions, conditions_of
 
+ROOT = Path(__file__).parents[2]
 FLAT = {"kd_min": 0.0, "kd_max": 0.0, "eps_over_d": 0.0, "surface": "plane"}
 
 
@@ -443,7 +445,8 @@ def test_the_terminal_shows_a_summary_within_80_columns_and_plain_where_nobody_l
         assert row.best in text
     # A line a situation at least, and no line for each of the run's rows.
     assert len(guide.advice) < len(text.splitlines()) < 60
-    assert [name for name, _ in groupby(line for line in text.splitlines() if line.startswith("light"))] == [
+    headed = [line for line in text.splitlines() if line.startswith(("light at", "light beside"))]
+    assert [name for name, _ in groupby(headed)] == [
         "light at the camera", "light beside the camera (ε/d up to 0.1)", "light beside the camera (ε/d above 0.1)"
     ]  # fmt: skip
     assert "\x1b[1m" in printed(run, 120, terminal=True)
@@ -477,6 +480,18 @@ def test_an_estimator_from_elsewhere_has_a_line_in_each_situation_on_page_and_te
     assert ">the same<" not in page
 
 
+def test_the_page_s_first_table_has_a_line_for_each_kind_of_light_and_best_method():
+    guide = guide_from(
+        rows_of("cone_axis", noisy(0.1, spread=0.01), "a"),
+        rows_of("cone_axis", noisy(0.2, spread=0.01), "b", **TUBE),
+        rows_of("curved", noisy(7.0, spread=0.01), "c", kd_min=-0.5, kd_max=0.5),
+    )
+    good, bad = answers(guide_content(guide, {}))
+    assert (good["best"], good["error"]) == ("cone_axis", "0.098 to 0.2°")
+    assert (bad["best"], bad["error"]) == ("curved", "7°")
+    assert bad["note"].endswith("breaks: saddle")
+
+
 def test_a_run_without_true_highlights_says_so(tmp_path):
     run = make_run(tmp_path, "noise", [row | {"true_id": None} for row in rows_of("cone_axis", [1.0])], items=0)
     assert "nothing to compare" in printed(run, 80, terminal=False)
@@ -496,6 +511,43 @@ def test_guide_json_holds_rows_and_figures_and_is_printed_with_json(tmp_path, ca
         assert tuple(row["settings"]) == advice.situation.settings
     print_json(run_record(run))
     assert json.loads(capsys.readouterr().out)["guide"] == content
+
+
+def test_the_overview_shows_what_practice_gives_beside_its_own_figures(tmp_path):
+    run = make_run(tmp_path, items=0)
+    text = " ".join(printed(run, 120, terminal=False).split())
+    page = (run / "index.html").read_text(encoding="utf-8")
+    told = practice("overview")
+    assert json.loads((run / "guide.json").read_text(encoding="utf-8"))["practice"] == told
+    for row in told["rows"]:
+        assert row["command"] in text
+        assert f"{row['command']}</code>" in page
+        assert f"{row['median_deg']:g}°" in text
+    assert practice("sensor") is None
+
+
+def test_readme_and_manual_have_the_figures_of_practice():
+    """One table, practice.toml, feeds page and terminal; README repeats it, and the manual's tables are its source."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    for row in practice("overview")["rows"]:
+        below = f"{row['p95_deg']:g}°" if "p95_deg" in row else ""
+        covers = f"{row['covered_percent']} %" if "covered_percent" in row else ""
+        cells = [f"{row['median_deg']:g}°", below, f"{row['region_deg']:g}°", covers, f"`{row['command']}`"]
+        line = f"| {row['surface']} | `{row['best']}` | {' | '.join(cells)} |"
+        assert line.replace("|  |", "| |") in readme
+    manual = (ROOT / "docs/gallery/estimators_measured.md").read_text(encoding="utf-8")
+    told = {row["surface"]: row for row in practice("overview")["rows"]}
+    for name in ("light given", "not given"):
+        row = told[f"organ's normal, light {name.removeprefix('light ')}"]
+        (line,) = [line for line in manual.splitlines() if line.startswith(f"| {name}, all |")]
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        assert row["answered"] == f"{cells[2]} of {cells[1]} frames"
+        assert [row["median_deg"], row["p95_deg"], row["region_deg"]] == [
+            float(cells[4]), float(cells[5]), round(float(cells[6]))
+        ]  # fmt: skip
+        assert f"{row['covered_percent']} %" == cells[7]
+    photograph = told["organ's normal, photograph of a phantom"]
+    assert f"| {photograph['median_deg']} | {photograph['region_deg']:.1f} |" in manual
 
 
 @pytest.mark.parametrize("spoil", [lambda file: file.unlink(), lambda file: file.write_text("{")])

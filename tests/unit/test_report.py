@@ -265,6 +265,15 @@ def test_overview_page_has_its_sections_and_files(overview):
     assert all(500 <= width <= 2500 and 400 <= height <= 2500 for width, height in shapes.values())
 
 
+def test_a_run_s_page_shows_the_answer_and_one_chart_and_folds_the_rest(overview):
+    page = read_page(overview[1])
+    folds = {attrs["id"]: "open" in attrs for tag, attrs in page.tags if tag == "details" and "id" in attrs}
+    assert {"guide", "axis_ratio", "error_vs_offset", "gallery", "summary", "provenance"} <= folds.keys()
+    assert not any(folds.values())
+    sections = [attrs["id"] for tag, attrs in page.tags if tag == "section" and "id" in attrs]
+    assert sections == ["answer", "error_vs_curvature"]
+
+
 def test_the_3d_view_is_coloured_by_curvature_where_the_run_kept_it(tmp_path):
     path = make_run(tmp_path, items=0)
     make_item(path / "gallery" / "item_00.npz", radius=4.0, curved=True)

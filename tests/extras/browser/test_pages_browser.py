@@ -1,33 +1,14 @@
-"""Run, nightly, realism, picture and 3D pages in a real browser: nothing overflows or is overprinted, axe is content.
+"""A page of each kind in a real browser: nothing overflows or is overprinted, axe is content."""
 
-axe-core comes with the package axe-playwright-python (extra test-extras), which bundles axe.min.js.
-"""
+from functools import cache
 
-import importlib.util
-from datetime import UTC, datetime
-from pathlib import Path
-
-import cv2
-import numpy as np
 import pytest
-from made_nights import history_of, run_of, verdict_of
-from test_nightly_page import rows_of
-from test_realism_page import frames
-from test_report import make_run
-
-from simtest.api import reconstruct_picture
-from simtest.nightly.page import write_nightly_page
-from simtest.nightly.records import JudgedRun
-from simtest.realism.compare import compare
-from simtest.realism.page import write_comparison
-from simtest.reconstruction.options import Options
-from simtest.report import write_report
-from simtest.report.scene3d import grid_triangles
-from simtest.report.viewer import Content, write_scene_page
+from axe import violations
+from page_kinds import KINDS
 
 pytestmark = pytest.mark.slow
 
-PAGES = ("run", "nightly", "realism", "picture", "view")
+PAGES = tuple(KINDS)
 WIDTHS = (1400, 1000, 390)
 SCHEMES = ("light", "dark")
 PHONE_HEIGHT = 844
@@ -80,44 +61,8 @@ OVERPRINTS = """() => {
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """One page of each kind, by name."""
-    folder = tmp_path_factory.mktemp("pages")
-    made = {"run": write_report(make_run(folder / "run", items=3))}
-    run = run_of(rows_of("overview", "noise"), datetime(2026, 3, 1, 2, 30, tzinfo=UTC))
-    judged = JudgedRun(run, verdict_of(run), history_of(run, 30))
-    made["nightly"] = write_nightly_page(folder / "nightly", judged)
-    made["realism"] = write_comparison(compare(frames(5), frames(5, first=9)), folder / "realism", "plain")
-    made["picture"] = picture_page(folder)
-    made["view"] = view_page(folder / "view.html")
-    return made
-
-
-def view_page(path: Path) -> Path:
-    """The page in 3D of a dome with one true normal and those of two estimators."""
-    x, y = np.meshgrid(np.linspace(-4, 4, 12), np.linspace(-4, 4, 12))
-    vertices = np.stack([x, y, 12 + 0.05 * (x**2 + y**2)], axis=-1)
-    at, tip = np.array([[0.0, 0.0, 12.0]]), np.array([[0.0, 0.0, 9.0]])
-    names = ("camera", "true normal", "cone_axis", "another_package_with_a_long_name")
-    points, none = vertices.reshape(-1, 3), np.empty((0, 3))
-    content = Content(
-        points, grid_triangles(vertices, 2.0), np.full(len(points), 0.1), none, none, np.full_like(points, 0.5),
-        np.zeros((1, 3)), np.array(names), np.repeat(at, 4, axis=0), np.concatenate([tip, tip, tip, tip + 0.2]),
-    )  # fmt: skip
-    write_scene_page(content, path, "a_scene_with_a_long_name")
-    return path
-
-
-def picture_page(folder: Path) -> Path:
-    """The page of a picture with a dozen spots on tissue."""
-    rng = np.random.default_rng(3)
-    y, x = np.mgrid[:240, :320]
-    picture = 0.3 + 0.02 * rng.standard_normal((240, 320))
-    for column, row in ((c, r) for c in range(40, 300, 70) for r in range(40, 220, 70)):
-        picture += 0.6 * np.exp(-((x - column) ** 2 + 1.4 * (y - row) ** 2) / 60)
-    cv2.imwrite(str(folder / "spots.png"), np.uint8(np.clip(255 * picture, 0, 254)))
-    with pytest.warns(UserWarning, match="no calibration"):
-        _, files = reconstruct_picture(folder / "spots.png", folder / "picture", Options(fov_deg=70.0))
-    return next(file for file in files if file.name == "index.html")
+    """Return the page of a kind, which is made when it is first asked for."""
+    return cache(lambda name: KINDS[name](tmp_path_factory.mktemp(name)))
 
 
 @pytest.fixture
@@ -129,7 +74,7 @@ def opened(browser, pages):
         contexts.append(browser.new_context(viewport=size, color_scheme=scheme, is_mobile=width < 600))
         page = contexts[-1].new_page()
         page.set_default_timeout(60_000)
-        page.goto(pages[name].as_uri())
+        page.goto(pages(name).as_uri())
         page.wait_for_load_state("networkidle")
         return page
 
@@ -168,23 +113,16 @@ def test_a_phone_shows_at_most_eight_screens_before_more(opened, name):
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("width", [1400, 390])
 @pytest.mark.parametrize("name", PAGES)
-def test_axe_finds_nothing_serious(opened, name, width, scheme):
-    found = importlib.util.find_spec("axe_playwright_python")
+def test_axe_finds_nothing(opened, name, width, scheme):
     page = opened(name, width, scheme)
     open_all(page)
-    page.evaluate(Path(found.submodule_search_locations[0], "axe.min.js").read_text(encoding="utf-8"))
-    # Charts that Vega draws are described by their boxes' labels, captions and tables.
-    report = page.evaluate("axe.run({exclude: ['.chart svg', 'iframe']}, {resultTypes: ['violations']})")
-    grave = [each for each in report["violations"] if each["impact"] in ("serious", "critical")]
-    assert [(each["id"], each["nodes"][0]["html"]) for each in grave] == []
+    assert violations(page) == []
 
 
 def test_axe_sees_a_planted_fault(opened):
-    found = importlib.util.find_spec("axe_playwright_python")
     page = opened("realism", 1400)
     page.evaluate("document.querySelector('img').removeAttribute('alt')")
-    page.evaluate(Path(found.submodule_search_locations[0], "axe.min.js").read_text(encoding="utf-8"))
-    assert "image-alt" in [each["id"] for each in page.evaluate("axe.run()")["violations"]]
+    assert "image-alt" in [name for name, _ in violations(page)]
 
 
 def test_the_overflow_check_sees_a_planted_fault(opened):
@@ -193,12 +131,13 @@ def test_the_overflow_check_sees_a_planted_fault(opened):
     assert any(text.startswith("H1") for text in page.evaluate(OVERFLOWS))
 
 
-def test_a_link_opens_the_section_that_is_folded_on_a_phone(opened):
-    page = opened("run", 390)
-    chart = page.locator("#error_vs_curvature .chart")
+@pytest.mark.parametrize("width", [1400, 390])
+def test_a_link_opens_the_section_that_is_folded(opened, width):
+    page = opened("run", width)
+    chart = page.locator("#axis_ratio .chart")
     assert not chart.is_visible()
-    page.locator("nav a[href='#error_vs_curvature']").click()
-    page.wait_for_selector("#error_vs_curvature svg.marks")
+    page.locator("nav a[href='#axis_ratio']").click()
+    page.wait_for_selector("#axis_ratio svg.marks")
     assert chart.is_visible()
 
 
@@ -210,8 +149,15 @@ def test_paper_shows_what_is_folded_and_folds_it_again(opened):
     assert page.locator("details.fold:not([open])").count() > 3
 
 
+def test_a_run_s_first_screen_shows_the_answer_and_a_chart(opened):
+    page = opened("run", 1400)
+    bottom = "part => document.querySelector(part).getBoundingClientRect().bottom"
+    assert page.evaluate(bottom, ".answer .chart") < PHONE_HEIGHT
+    assert page.evaluate(bottom, "#answer h2") < PHONE_HEIGHT / 4
+
+
 def test_the_run_page_is_small(pages):
-    assert pages["run"].stat().st_size <= 1_500_000
+    assert pages("run").stat().st_size <= 1_500_000
 
 
 def test_the_overprint_check_sees_a_planted_fault(opened):
