@@ -48,15 +48,13 @@ def render(
     and lobe, as far as the scene says that they are known; `simtest reconstruct --camera` reads it.
     """
     from simtest import api
-    from simtest.simulation.highlights import NO_HIGHLIGHT, REMEDIES
 
     out = out or Path("reports/frames") / Path(scene).stem
     with exclusive_folder(out):
         with progress_bar("finding the truth", stopped="nothing is written") as move:
             frame = api.render(scene, values_of(settings), variant, move)
         files = frame.write(out)
-    lines = [] if frame.highlights else [f"{NO_HIGHLIGHT}: {REMEDIES[NO_HIGHLIGHT]}"]
-    return Told(files, {"highlights": len(frame.highlights)}, lines)
+    return Told(files, {"highlights": len(frame.highlights)}, [frame.advice] if frame.advice else [])
 
 
 @command

@@ -26,6 +26,8 @@ from simtest.runtime.arrays import Array, Image, Mask, short_repr
 from simtest.runtime.files import as_path
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.highlights import (
+    NO_HIGHLIGHT,
+    REMEDIES,
     CloudRegions,
     TrueHighlight,
     VisibleHighlight,
@@ -170,6 +172,11 @@ class LabelledFrame(RenderedView):
     truth: TruthMaps
     world_from_camera: Array
     variant: str
+
+    @property
+    def advice(self) -> str:
+        """What to change where the frame shows no highlight; else empty."""
+        return "" if self.highlights else f"{NO_HIGHLIGHT}: {REMEDIES[NO_HIGHLIGHT]}"
 
     def write(self, folder: str | Path) -> list[Path]:
         """Write the files of `simtest render` into a folder, made if need be; return them."""

@@ -101,7 +101,8 @@ The table of situations. `rows` has an object for each: `surface`, `circumstance
 `base`), `best`, `ties` (methods that cannot be distinguished from it), `unranked` (why the order is open, or
 empty), `error`, `answered`, `unanswered`, `breaks`, `is_broken` (the best method's figures in words), `methods` and
 `best_by_setting` with the figures `n`, `answered`, `missed`, `refused`, `failed`, `median_deg`, `mean_deg`,
-`interval_deg` (95 % of the median; null below 5 frames), `mean_penalised_deg` and `breaks`. `methods`, `shared`,
+`interval_deg` (95 % of the median; null below 5 frames), `mean_penalised_deg` and `breaks`. `practice` has, for
+`overview`, what pictures from practice give (`title`, `about`, `rows`), else null. `methods`, `shared`,
 `seen`, `left_out`, `rules` and `words` explain the table.
 
 ## A dataset

@@ -205,9 +205,7 @@ def test_a_fisheye_reads_back(tmp_path):
 
 
 def test_the_example_of_the_manual_reads_back(tmp_path):
-    manual = (Path(__file__).resolve().parents[2] / "docs" / "howto" / "calibrate_a_camera.md").read_text(
-        encoding="utf-8"
-    )
+    manual = (Path(__file__).resolve().parents[2] / "docs/howto/cameras.md").read_text(encoding="utf-8")
     (example,) = [block for block in re.findall(r"```toml\n(.*?)```", manual, flags=re.S) if "[rig]" in block]
     (tmp_path / "example.toml").write_text(example)
     stated = simtest.load_calibration(tmp_path / "example.toml")

@@ -535,7 +535,7 @@ def test_readme_and_manual_have_the_figures_of_practice():
         cells = [f"{row['median_deg']:g}°", below, f"{row['region_deg']:g}°", covers, f"`{row['command']}`"]
         line = f"| {row['surface']} | `{row['best']}` | {' | '.join(cells)} |"
         assert line.replace("|  |", "| |") in readme
-    manual = (ROOT / "docs/gallery/estimators_measured.md").read_text(encoding="utf-8")
+    manual = (ROOT / "docs/measured/clouds.md").read_text(encoding="utf-8")
     told = {row["surface"]: row for row in practice("overview")["rows"]}
     for name in ("light given", "not given"):
         row = told[f"organ's normal, light {name.removeprefix('light ')}"]

@@ -124,4 +124,4 @@ def test_in_the_dark_nothing_counts_as_found():
     (found,) = coverage(run).found.iter_rows(named=True)
     assert (found["true"], found["found"], found["detections"], found["missed"]) == (3, 0, 0, 0)
     assert (found["coverage"], found["false_share"]) == (0.0, None)
-    assert _counted(rows) == (3, 0, 0, 0)
+    assert _counted(rows) == (3, 0, 0, 0, 0, 0)
