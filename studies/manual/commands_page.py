@@ -74,7 +74,7 @@ def _section(text: str) -> str:
     further = _further(title.split()[2:])
     usage, fence, rest = body.rpartition("```\n")
     head, _, options = rest.partition("\n**")
-    if not further or not options:
+    if not further or not options or further in body:
         return text
     return f"{title}\n{usage}{fence}{head.rstrip()}\n\n{further}\n\n**{options}"
 

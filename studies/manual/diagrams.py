@@ -341,13 +341,13 @@ def detection(drawing: Drawing) -> None:
     """Draw the way from a picture to the highlights that are answered: steps, the rule of saddles, kinds."""
     # Specular light along a row of the picture: two summits that stay apart, two that are one cluster.
     x = np.linspace(0, 350, 71)
-    lobes = ((70, 100, 22), (157, 74, 18), (252, 88, 18), (288, 80, 15))
+    lobes = ((70, 100, 22), (157, 74, 18), (252, 88, 16), (296, 80, 15))
     light = 8 + sum(height * np.exp(-(((x - place) / width) ** 2) / 2) for place, height, width in lobes)
     row = np.stack([35 + x, 280 - light], axis=1)
     drawing.line([*row, (385, 288), (35, 288)], "none", fill=pale(BLUE))
     drawing.line(row, BLUE, 2)
     drawing.circle(row[24], 4, WHITE, GREEN)
-    drawing.circle(row[54], 4, WHITE, VERMILION)
+    drawing.circle(row[55], 4, WHITE, VERMILION)
     for isovalue in (0.5, 0.65, 0.8):
         size = 66 * np.sqrt(-np.log2(isovalue))
         drawing.line(ring((520, 208), size, 0.62 * size, 0.3), BLUE, 1.6, fill=pale(BLUE, 0.1))
@@ -357,7 +357,7 @@ def detection(drawing: Drawing) -> None:
         "clipped": "half of it or more is clipped",
         "small": "fewer than 12 pixels",
         "cluster": "summits in one outline",
-        "elongated": "a streak, axis ratio < 0.12",
+        "elongated": "axis ratio below 0.12",
         "merged": "isophotes are no ellipses",
         "border": "cut by the view's border",
         "inter_reflection": "has the tissue's tint",
