@@ -813,7 +813,7 @@ def test_pictures_and_frames_have_a_folder_of_their_own_where_none_is_named(tmp_
         reconstruct(Path("shot.png"), known=PictureOptions(fov_deg=60.0))
     assert (tmp_path / "reports/normals/shot/normals.csv").is_file()
     written: list[Path] = []
-    drawn = SimpleNamespace(highlights=[], write=lambda out: written.append(out) or [])
+    drawn = SimpleNamespace(highlights=[], advice="", write=lambda out: written.append(out) or [])
     monkeypatch.setattr("simtest.api.render", lambda *_: drawn)
     render("plane")
     render("plane", out=Path("here"))
