@@ -1,8 +1,8 @@
 """What ten million frames cost: processor time, disk, and the run on a cluster; one command, some minutes.
 
-`python -m benchmarks cost` prints the table of docs/measured/performance.md. Samples of anatomies that were never made before
-are timed one by one, encoded and written as a dataset's run does it. An anatomy's own cost is what its first sample
-takes beyond its others. The rest is arithmetic.
+`python -m benchmarks cost` prints the table of docs/measured/performance.md. Samples of new anatomies are
+timed one by one, encoded and written as a dataset's run does it. An anatomy's own cost is what its first sample takes
+beyond its others. The rest is arithmetic.
 """
 
 import os
