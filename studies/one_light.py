@@ -2,7 +2,6 @@
 
     python -m studies.one_light [FRAMES] [SEED] [ROWS.json]
     python -m studies.one_light --base [FRAMES] [SEED] [ROWS.json]
-    python -m studies.one_light --clouds [FRAMES] [SEED]
 
 Frames are those of the recipe `endoscopy` through its camera chains, with a seed of this study alone: colon, stomach,
 liver and gallbladder in equal shares, under the first light of their scope alone, which in every second frame stands at
@@ -10,9 +9,9 @@ the camera; the relief's slope is drawn anew, from 2 to 8 deg. What is told is t
 working range; a light beside the camera is also judged with a told distance. The best estimates are scored by
 kind of highlight. "Before" is the same picture without room for near misses
 (`simtest.estimators.prior_parts`), the negative control. A second table is of the base's normals: of single highlights,
-and of clouds. Nothing was tuned on the seed. With `--clouds` only those are judged, on colon, stomach and liver. With
-`--base` only single highlights against the base's normal are judged: with the default prior of the relief's slope, with
-the slope told exactly, and, as negative control, with slopes up to 8 deg that are no steeper at highlights.
+and of clouds. Nothing was tuned on the seed. With `--base` only single highlights against the base's normal are judged:
+with the default prior of the relief's slope, with the slope told exactly, and, as negative control, with slopes up to
+8 deg that are no steeper at highlights.
 """
 
 import json
@@ -61,9 +60,6 @@ SEED = 9642
 """Of the frames; nothing was tuned on them."""
 
 FRAMES = 36
-
-PLANNED = 120
-"""Frames of the plan whose first ones `clouds_alone` judges, so that a longer run goes on where a shorter one ended."""
 
 SLOPES_DEG = (2.0, 8.0)
 
@@ -135,14 +131,9 @@ def told(view: RenderedView, family: int) -> Calibration:
 
 def main(arguments: Sequence[str]) -> int:
     """Measure, and print the tables; return 1 where the coverage is not what is aimed at."""
-    modes = [given for given in arguments if given.startswith("--")]
-    arguments = [given for given in arguments if given not in modes]
-    usual = BASE_SEED if "--base" in modes else SEED
+    of_base, arguments = "--base" in arguments, [given for given in arguments if given != "--base"]
+    usual, judge, tell = (BASE_SEED, base_rows, report_base) if of_base else (SEED, _rows, report)
     frames, seed = (int(arguments[i]) if len(arguments) > i else default for i, default in ((0, FRAMES), (1, usual)))
-    if "--clouds" in modes:
-        clouds_alone(frames, seed)
-        return 0
-    judge, tell = (base_rows, report_base) if "--base" in modes else (_rows, report)
     plan, rows = OneLight(seed, frames), list[Row]()
     for number in range(frames):
         made = rendered(plan, number)
@@ -154,23 +145,6 @@ def main(arguments: Sequence[str]) -> int:
         if len(arguments) > 2:
             Path(arguments[2]).write_text(json.dumps(rows), encoding="ascii")
     return tell(rows)
-
-
-def clouds_alone(frames: int, seed: int) -> None:
-    """Print the table of the clouds of colons, stomachs and livers, a line for each organ."""
-    plan, rows = OneLight(seed, PLANNED), list[Row]()
-    for number in range(frames):
-        if ORGANS[plan.draw(number).anatomy.family] == "gallbladder" or (made := rendered(plan, number)) is None:
-            continue
-        session, view, family = made
-        picture = in_8_bits(view)
-        clouds = run(picture, told(view, family), Options(estimators=("cloud",), target="base"))
-        rows += _cloud_rows(session, view, clouds, {"frame": number, "organ": ORGANS[family]})
-        print(f"frame {number}: {len(rows)} clouds so far", file=sys.stderr, flush=True)
-    about = {"all": rows, **{organ: [row for row in rows if row["organ"] == organ] for organ in ORGANS}}
-    about["about no highlight point"] = [row for row in rows if row["of"] == "none"]
-    lines = [_line(name, part)[:6] for name, part in about.items() if part]
-    print_markdown([["clouds", "frames", "n", "RMS error, deg", "stated, deg", "held"], *lines])
 
 
 def report_base(rows: Sequence[Row]) -> int:

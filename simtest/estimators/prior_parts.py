@@ -151,8 +151,9 @@ SPOT_ONSET = math.radians(fitted_number("spots_on_relief.onset"))
 
 STEEPER, FADES = fitted_number("steeper.share"), math.radians(fitted_number("steeper.fades"))
 """Highlights lie where a surface bends (theory.md 7.1), and pits and ridges are steep where they bend: all glints by
-1.07 (colon), 1.80 (liver) and 2.42 times (stomach; `studies.clouds.glint_slope`). A view that cuts a cloud may also
-show its steep side alone. A plane shows the whole cloud of a relief that is alike everywhere, so that it is 1 there."""
+1.07 (colon), 1.80 (liver) and 2.42 times (stomach; 12,000 points of each relief, script not kept). A view that cuts a
+cloud may also show its steep side alone. A plane shows the whole cloud of a relief that is alike everywhere, so that it
+is 1 there."""
 
 STEP_MM = 1e-3  # step of a light's position, mm, for the differences of the normal
 SHARES = (np.arange(64) + 0.5) / 64  # at these shares a prior of one number is sampled

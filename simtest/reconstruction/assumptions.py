@@ -30,7 +30,8 @@ WIDEST_PINHOLE_DEG = 100.0
 
 LENS_SD = 0.17
 """Standard deviation of k1 about such a lens whose edge is given: of a stereographic one k1 is 1/12, equisolid -1/24,
-orthographic -1/6, a pinhole 1/3. `python -m studies.wide_fov` draws them; of pinholes from 90 deg on few are held."""
+orthographic -1/6, a pinhole 1/3. tests/statistical/test_wide_fov.py draws them; of pinholes from 90 deg on
+few are held."""
 
 
 @dataclass(frozen=True)

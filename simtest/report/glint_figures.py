@@ -245,7 +245,7 @@ def _radii(spots: pl.DataFrame) -> Iterator[ReliefFigure]:
         "The radius of each isolated highlight that is alone in its spot: that of the circle of its area above half "
         "height in the frame without noise, against that of a highlight of the fine surface's curvature at the glint "
         "(theory, section 7, item 3). Relief below a pixel and sources of finite size are not drawn: they widen the "
-        "lobe (item 6); python -m studies.unresolved_relief and python -m studies.source_size measure by how much."
+        "lobe (item 6); python -m studies.unresolved_relief measures by how much a relief does."
     )
     caption = "A point is a highlight; dashes are the law. An area counts whole pixels."
     yield ReliefFigure(Chart("relief_radius", "Glints: radius in the frame against its law", (panel,), 460), about,

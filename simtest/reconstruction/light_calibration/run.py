@@ -48,7 +48,7 @@ COMMON_PX, COMMON_RADIUS_PX = 0.015, 0.012
 UNSURE = 1.5
 """The same, in standard deviations of each outline's own error: where the ball is as bright as the room behind it,
 that is so on the same side in all pictures. On mirror balls it is up to 3 of them
-(`studies.light_calibration.outlines`)."""
+(45 drawn rigs; script not kept)."""
 
 SHADED_PX = 0.03
 """The ball's shadow beside its outline moves all outlines away from the lights, by so many px for each mm that the
