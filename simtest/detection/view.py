@@ -17,6 +17,7 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry import Array, Image, Mask, ViewMask
 from simtest.geometry.patch import dilated
 from simtest.runtime.arrays import short_repr
+from simtest.runtime.fitted import fitted_number
 
 WORKING_PX = 480
 """Longer side of the picture in which the border is searched."""
@@ -74,18 +75,18 @@ STROKE = 0.2
 STROKES = 0.75
 """Largest share of a character's box that its strokes fill."""
 
-SOLID, SOLID_ALONE, SOLID_PX = 0.9, 0.95, 8
+SOLID, SOLID_ALONE, SOLID_PX = fitted_number("overlays.solid"), fitted_number("overlays.solid_alone"), 8
 """A square that hides a character fills this share of its box, one that stands alone the second, with so many pixels a
 side or more. A round highlight fills 0.8."""
 
-PITCH, OFF_ROW = (1.2, 2.4), 0.2
+PITCH, OFF_ROW = (fitted_number("overlays.least_pitch"), fitted_number("overlays.most_pitch")), 0.2
 """Distance of neighbouring rows of a block over the characters' height; larger ones span rows that are empty. A line
 farther off than the second share of it is on no row."""
 
 ROWS_BEYOND = 4
 """The rows of a block are searched so far beyond the lines that are sure."""
 
-ON_ROW_PX = 1.5
+ON_ROW_PX = fitted_number("overlays.on_row")
 """What is written on a row begins at its top or ends at its bottom within this distance."""
 
 STREAK_LENGTH = 0.045
@@ -392,7 +393,7 @@ def _on_row(stats: np.ndarray, row: float, size: float, start: int, end: int) ->
     """Return the boxes of what is written on a row of a block of text: its pieces, between which are no wide gaps."""
     left, top, width, height, _ = stats.T
     bottom = top + height
-    inside = (top >= row - 2) & (bottom <= row + 1.25 * size) & (width <= 1.5 * size)
+    inside = (top >= row - 2) & (bottom <= row + size + 2) & (width <= 1.5 * size)
     at_ends = (np.abs(top - row) <= ON_ROW_PX) | (np.abs(bottom - row - size) <= ON_ROW_PX)
     groups: list[list[int]] = []
     right = -np.inf
@@ -404,7 +405,7 @@ def _on_row(stats: np.ndarray, row: float, size: float, start: int, end: int) ->
     return [
         (int(left[g].min()) - 2, int(top[g].min()) - 2, int((left[g] + width[g]).max()) + 2, int(bottom[g].max()) + 2)
         for g in groups
-        if start - size <= left[g].min() <= end + size and np.count_nonzero(at_ends[g]) >= CHARACTERS - 1
+        if start - size <= left[g].min() <= end + size and np.count_nonzero(at_ends[g]) >= CHARACTERS
     ]
 
 
