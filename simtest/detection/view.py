@@ -83,6 +83,9 @@ PITCH, OFF_ROW = (fitted_number("overlays.least_pitch"), fitted_number("overlays
 """Distance of neighbouring rows of a block over the characters' height; larger ones span rows that are empty. A line
 farther off than the second share of it is on no row."""
 
+BLANK = 0.5
+"""Pieces of characters that are too faint to be seen lie so near to the ends of a line, over the characters' height."""
+
 ROWS_BEYOND = 4
 """The rows of a block are searched so far beyond the lines that are sure."""
 
@@ -136,23 +139,27 @@ def find_view(picture: npt.NDArray[np.floating]) -> View:
     scale = min(1.0, WORKING_PX / max(height, width))
     size = (max(round(width * scale), 8), max(round(height * scale), 8))
     small = cv2.resize(np.ascontiguousarray(picture, dtype=np.float32), size, interpolation=cv2.INTER_AREA)
-    brightness = brightest_channel(small)
+    boxes = _coloured_boxes(small)
+    # What such a box hides is as dark as the black one of an inset.
+    brightness = np.where(boxes, np.float32(0), brightest_channel(small))
+    whole = View(cv2.resize(boxes.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) == 0)
+    whole = whole if boxes.any() else View()
     inside = _inside(brightness)
     if inside is None:
-        return View()
+        return whole
     border = _border(inside)
     if len(border) < 30:
-        return View()
+        return whole
     tolerance = max(1.5, TOLERANCE * max(size))
     ratio = np.array([width / size[0], height / size[1]])
     inside, notch = _without_notch(inside)
     hull = cv2.convexHull(_row_ends(inside))
     filled = cv2.fillConvexPoly(np.zeros(inside.shape, np.uint8), hull, 1) > 0
     # Cut corners also lie on a circle, within a pixel or two, so straight sides are tried first.
-    polygon = _is_polygon(inside, filled, hull)
+    polygon = _is_polygon(inside | boxes, filled, hull)
     circle = None if polygon else _circle(border, tolerance)
     if circle is None and not polygon:
-        return View()
+        return whole
     if circle is not None:
         x, y, radius = circle
         grid_x, grid_y = np.arange(size[0]) - x, np.arange(size[1]) - y
@@ -164,7 +171,7 @@ def find_view(picture: npt.NDArray[np.floating]) -> View:
         round_border = None
         dents = (filled & ~inside).astype(np.uint8)
         filled &= cv2.morphologyEx(dents, cv2.MORPH_OPEN, np.ones((DENT_PX, DENT_PX), np.uint8)) == 0
-    filled &= ~(notch | _coloured_boxes(small))
+    filled &= ~(notch | boxes)
     # The view less its rim. The distance transform ignores the picture's own edges, along which there is no rim.
     filled &= ~_bars(brightness)
     depth = cv2.distanceTransform(filled.astype(np.uint8), cv2.DIST_L2, 5)
@@ -361,13 +368,8 @@ def _text_lines(labels: np.ndarray, stats: np.ndarray, square: Mask) -> list[_Co
         like = abs(float(np.median(height[line])) - size) <= max(1.0, SLACK * size)
         if line not in sure and like and start - size <= left[line[0]] <= end + size and len(line) >= CHARACTERS - 1:
             sure.append(line)
-    # A row of the block is text from end to end: characters before bright tissue are seen in parts.
-    end = max(int(left[line[-1]] + width[line[-1]]) for line in sure)
-    reach = int(1.5 * size)
-    boxes = [
-        (start - reach, int(np.min(top[line])) - 2, end + reach, int(np.max(top[line] + height[line])) + 2)
-        for line in sure
-    ]
+    margin = round(BLANK * size)
+    boxes = [_box(stats, line, margin) for line in sure]
     rows = _rows(np.array([np.median(top[line]) for line in sure]), size)
     return boxes + [box for row in rows for box in _on_row(stats, row, size, start, end)]
 
@@ -403,10 +405,18 @@ def _on_row(stats: np.ndarray, row: float, size: float, start: int, end: int) ->
         groups[-1].append(i)
         right = max(right if len(groups[-1]) > 1 else 0, int(left[i] + width[i]))
     return [
-        (int(left[g].min()) - 2, int(top[g].min()) - 2, int((left[g] + width[g]).max()) + 2, int(bottom[g].max()) + 2)
+        _box(stats, g, 2)
         for g in groups
         if start - size <= left[g].min() <= end + size and np.count_nonzero(at_ends[g]) >= CHARACTERS
     ]
+
+
+def _box(stats: np.ndarray, parts: list[int], margin: int) -> _Corners:
+    """Return the box around components, with a margin at its ends."""
+    left, top, width, height, _ = stats[parts].T
+    return (
+        int(left.min()) - margin, int(top.min()) - 2, int((left + width).max()) + margin, int((top + height).max()) + 2
+    )  # fmt: skip
 
 
 def _is_thin(labels: np.ndarray, box: np.ndarray, number: int) -> bool:
