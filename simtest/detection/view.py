@@ -342,7 +342,8 @@ def _text_lines(labels: np.ndarray, stats: np.ndarray, square: Mask) -> list[_Co
     fitting = (height >= low) & (height <= high) & (width <= 1.5 * height) & (area <= STROKES * width * height)
     # A thin stroke, as that of the 1, may fill its box.
     fitting |= (height >= low) & (height <= high) & (width <= 0.35 * height)
-    characters = [i for i in np.flatnonzero(fitting | square).tolist() if square[i] or _is_thin(labels, stats[i], i + 1)]
+    characters = np.flatnonzero(square).tolist()
+    characters += [i for i in np.flatnonzero(fitting & ~square).tolist() if _is_thin(labels, stats[i], i + 1)]
     characters.sort(key=lambda i: int(left[i]))
     lines: list[list[int]] = []
     for i in characters:
@@ -370,6 +371,7 @@ def _text_lines(labels: np.ndarray, stats: np.ndarray, square: Mask) -> list[_Co
             sure.append(line)
     margin = round(BLANK * size)
     boxes = [_box(stats, line, margin) for line in sure]
+    # Characters before bright tissue are seen in parts, and thin type in pieces: these stand on the block's rows.
     rows = _rows(np.array([np.median(top[line]) for line in sure]), size)
     return boxes + [box for row in rows for box in _on_row(stats, row, size, start, end)]
 

@@ -26,9 +26,9 @@ Peak = tuple[int, int]
 
 @dataclass(frozen=True)
 class OverlayCounts:
-    """Answered highlights of some frames: all and those on overlays, with and without the mask; the tissue's that it hides.
+    """Highlights of some frames that are answered, and those of them on overlays.
 
-    `kept` counts without the mask; `tissue` of them lie on no box, and `hidden` of these are answered only without it.
+    `kept` counts without the mask; `tissue` of these lie on no box, and `hidden` of the latter are not answered with it.
     """
 
     answered: int = 0

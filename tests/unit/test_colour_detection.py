@@ -169,7 +169,9 @@ def test_text_is_looked_for_before_spots_go_that_do_not_stand_out(monkeypatch):
     """It is known by whole lines."""
     asked = []
     monkeypatch.setattr(colour_detection, "_stands_out", lambda *_: False)
-    monkeypatch.setattr(colour_detection, "find_foreign", lambda bright, *_: asked.append(bright) or np.zeros_like(bright))
+    monkeypatch.setattr(
+        colour_detection, "find_foreign", lambda bright, *_: asked.append(bright) or np.zeros_like(bright)
+    )
     assert kinds(lobe(160, 120, 6.0)) == []
     assert asked[0][120, 160]
 
