@@ -28,7 +28,7 @@ Peak = tuple[int, int]
 class OverlayCounts:
     """Highlights of some frames that are answered, and those of them on overlays.
 
-    `kept` counts without the mask; `tissue` of these lie on no box, and `hidden` of the latter are not answered with it.
+    `kept` counts without the mask; `tissue` of these lie on no box, and `hidden` of those are not answered with it.
     """
 
     answered: int = 0
