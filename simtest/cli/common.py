@@ -227,6 +227,9 @@ class PictureOptions:
     every: Annotated[
         bool, flag("Take peaks too that the border cuts or whose shape is not that of one point highlight.", "--all")
     ] = False
+    keep_overlays: Annotated[
+        bool, flag("Found by colour: take text and squares that are drawn on the picture for tissue.")
+    ] = False
 
     def checked(self, **others: Any) -> "Options":
         """Return them, and others, as the reconstruction takes them; raise `InputError` where they are malformed."""

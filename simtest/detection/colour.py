@@ -87,13 +87,16 @@ class ColourDetection:
         return [highlight for highlight in self.highlights if highlight.is_isolated]
 
 
-def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> ColourDetection:
+def detect_colour(
+    linear: Image, clipped: Mask, seen: Mask | None = None, keep_overlays: bool = False
+) -> ColourDetection:
     """Find the highlights of a colour frame.
 
     In a highlight's pixels the specular light is at least the tissue's, at least 10 % of the highlight's peak, and more
     than noise. Both parts follow from the tissue's own colour around each pixel (`split_light`), so there is no global
     threshold. `linear`, shape (H, W, 3), is white-balanced, share of full scale: light mirrored by the surface is grey.
-    `clipped`, shape (H, W), is where a channel is clipped, `seen` are the pixels inside the view, default all.
+    `clipped`, shape (H, W), is where a channel is clipped, `seen` are the pixels inside the view, default all. With
+    `keep_overlays` text and squares are taken for tissue.
     """
     picture = ColourPicture.of(linear, clipped, seen)
     light, shape = picture.light, clipped.shape
@@ -109,7 +112,7 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
     spots = find_spots(specular, tissue, candidates, least, noise, picture.flat)
     spots = _brighter_than_around(spots, total, bare, ratio)
     bright = _pixels(spots, shape)
-    foreign = find_foreign(bright)
+    foreign = find_foreign(bright, not keep_overlays)
     spots = [spot for spot in spots if not foreign[spot.crop][spot.mask].mean() > ON_FOREIGN]
     # Only now: text is known by whole lines.
     spots = [spot for spot in spots if _stands_out(spot, total, bare)]
@@ -220,16 +223,19 @@ class ColourDetector:
     ----------
     isolated : bool
         Leave out highlights of the other kinds, but for clusters: these are told, and no estimator answers for them.
+    keep_overlays : bool
+        Take text and squares that are drawn on the picture for tissue.
     """
 
     isolated: bool = True
+    keep_overlays: bool = False
 
     def detect(self, frame: Frame, camera: Camera, priors: Priors = NO_PRIORS) -> Detection:
         """Find the highlights of a frame; raise `InputError` where it has not three channels."""
         if frame.encoded.ndim != 3 or frame.encoded.shape[2] != 3:
             raise InputError(f"frame has shape {frame.encoded.shape}: detection by colour takes (H, W, 3)")
         view = view_of(frame)
-        detected = detect_colour(frame.channels, frame.clipped, view.seen)
+        detected = detect_colour(frame.channels, frame.clipped, view.seen, self.keep_overlays)
         kinds = (*SINGLE, Kind.CLUSTER) if self.isolated else tuple(Kind)
         taken = tuple(highlight for highlight in detected.highlights if highlight.kind in kinds)
         others = tuple(highlight for highlight in detected.highlights if highlight.kind not in kinds)

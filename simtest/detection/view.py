@@ -1,6 +1,7 @@
 """What of a picture shows no tissue: outside of a view that is round or has cut corners, burnt-in text, instruments.
 
-Text stands in lines of characters of one height with thin strokes. A tool is straight and far longer than wide, and so
+Text stands in lines of characters of one height with thin strokes, and these on the rows of one block; squares that
+hide a name fill their boxes. A tool is straight and far longer than wide, and so
 is what shines along it; what shines close beside such a streak belongs to the tool as well.
 """
 
@@ -16,6 +17,7 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry import Array, Image, Mask, ViewMask
 from simtest.geometry.patch import dilated
 from simtest.runtime.arrays import short_repr
+from simtest.runtime.fitted import fitted_number
 
 WORKING_PX = 480
 """Longer side of the picture in which the border is searched."""
@@ -45,6 +47,13 @@ NOTCH, NOTCH_DARK = 0.1, 0.98
 """An inset's black box has at least this share of the view's height and width, and that share of it is dark: a cut
 corner is dark by half."""
 
+DENT_PX = 7
+"""A dent of a straight border as wide as this, px of the working picture, is a badge's box."""
+
+UNLIKE_TISSUE, BOX_PX, BOX_FILLED = 0.1, 10, 0.9
+"""A box of one colour, which hides the tissue: green or blue exceeds red by this, encoded; it has so many pixels a side
+or more in the working picture, and fills that share of the box around it."""
+
 MARGIN = 0.012
 """Width of the rim that belongs to the border, as a share of the picture's longer side: bright edges, stray light."""
 
@@ -66,6 +75,23 @@ STROKE = 0.2
 STROKES = 0.75
 """Largest share of a character's box that its strokes fill."""
 
+SOLID, SOLID_ALONE, SOLID_PX = fitted_number("overlays.solid"), fitted_number("overlays.solid_alone"), 8
+"""A square that hides a character fills this share of its box, one that stands alone the second, with so many pixels a
+side or more. A round highlight fills 0.8."""
+
+PITCH, OFF_ROW = (fitted_number("overlays.least_pitch"), fitted_number("overlays.most_pitch")), 0.2
+"""Distance of neighbouring rows of a block over the characters' height; larger ones span rows that are empty. A line
+farther off than the second share of it is on no row."""
+
+BLANK = 0.5
+"""Pieces of characters that are too faint to be seen lie so near to the ends of a line, over the characters' height."""
+
+ROWS_BEYOND = 4
+"""The rows of a block are searched so far beyond the lines that are sure."""
+
+ON_ROW_PX = fitted_number("overlays.on_row")
+"""What is written on a row begins at its top or ends at its bottom within this distance."""
+
 STREAK_LENGTH = 0.045
 """Least length of an instrument's streak, as a share of the picture's longer side."""
 
@@ -74,6 +100,10 @@ STREAK_WIDTH = 0.06
 
 TOOL_WIDTH, TOOL_ENDS = 0.55, 0.6
 """What lies nearer to a streak than this share of its length, or beyond its ends by the second, is on the tool too."""
+
+
+_Corners = tuple[int, int, int, int]
+"""Left, top, right, bottom of a box, px; the last two are outside."""
 
 
 @dataclass(frozen=True)
@@ -109,23 +139,27 @@ def find_view(picture: npt.NDArray[np.floating]) -> View:
     scale = min(1.0, WORKING_PX / max(height, width))
     size = (max(round(width * scale), 8), max(round(height * scale), 8))
     small = cv2.resize(np.ascontiguousarray(picture, dtype=np.float32), size, interpolation=cv2.INTER_AREA)
-    brightness = brightest_channel(small)
+    boxes = _coloured_boxes(small)
+    # What such a box hides is as dark as the black one of an inset.
+    brightness = np.where(boxes, np.float32(0), brightest_channel(small))
+    whole = View(cv2.resize(boxes.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) == 0)
+    whole = whole if boxes.any() else View()
     inside = _inside(brightness)
     if inside is None:
-        return View()
+        return whole
     border = _border(inside)
     if len(border) < 30:
-        return View()
+        return whole
     tolerance = max(1.5, TOLERANCE * max(size))
     ratio = np.array([width / size[0], height / size[1]])
     inside, notch = _without_notch(inside)
     hull = cv2.convexHull(_row_ends(inside))
     filled = cv2.fillConvexPoly(np.zeros(inside.shape, np.uint8), hull, 1) > 0
     # Cut corners also lie on a circle, within a pixel or two, so straight sides are tried first.
-    polygon = _is_polygon(inside, filled, hull)
+    polygon = _is_polygon(inside | boxes, filled, hull)
     circle = None if polygon else _circle(border, tolerance)
     if circle is None and not polygon:
-        return View()
+        return whole
     if circle is not None:
         x, y, radius = circle
         grid_x, grid_y = np.arange(size[0]) - x, np.arange(size[1]) - y
@@ -135,7 +169,9 @@ def find_view(picture: npt.NDArray[np.floating]) -> View:
         round_border = ViewMask(float(cx), float(cy), float(radius * ratio.mean()))
     else:
         round_border = None
-    filled &= ~notch
+        dents = (filled & ~inside).astype(np.uint8)
+        filled &= cv2.morphologyEx(dents, cv2.MORPH_OPEN, np.ones((DENT_PX, DENT_PX), np.uint8)) == 0
+    filled &= ~(notch | boxes)
     # The view less its rim. The distance transform ignores the picture's own edges, along which there is no rim.
     filled &= ~_bars(brightness)
     depth = cv2.distanceTransform(filled.astype(np.uint8), cv2.DIST_L2, 5)
@@ -189,6 +225,21 @@ def _without_notch(inside: Mask) -> tuple[Mask, Mask]:
             notch[top:bottom, left:right] = dilated(box)
             return inside | notch, notch
     return inside, none
+
+
+def _coloured_boxes(small: Image) -> Mask:
+    """Return the boxes of a small picture that are filled with a colour that tissue has not, whatever is in them."""
+    boxes = np.zeros(small.shape[:2], dtype=bool)
+    if small.ndim == 3:
+        pure = (small[..., 1:].max(axis=2) - small[..., 0] >= UNLIKE_TISSUE).astype(np.uint8)
+        contours, _ = cv2.findContours(pure, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        for contour in contours:
+            x, y, width, height = cv2.boundingRect(contour)
+            # A contour runs through the pixels at the edge. Under narrow-band light all of the view is green.
+            area = cv2.contourArea(contour) + cv2.arcLength(contour, True) / 2
+            if min(width, height) >= BOX_PX and BOX_FILLED * width * height <= area <= pure.size / 4:
+                boxes[y : y + height, x : x + width] = True
+    return dilated(boxes)
 
 
 def _row_ends(inside: Mask) -> npt.NDArray[np.int32]:
@@ -258,29 +309,41 @@ def _is_polygon(inside: Mask, filled: Mask, hull: npt.NDArray[np.int32]) -> bool
     return len(cv2.approxPolyDP(hull, SIDE_PX, True)) <= MAX_CORNERS
 
 
-def find_foreign(bright: Mask) -> Mask:
-    """Return the areas of text and instruments, shape (H, W), where what shines is no highlight.
+def find_foreign(bright: Mask, overlays: bool = True) -> Mask:
+    """Return the areas of instruments and overlays, shape (H, W), where what shines is no highlight.
 
-    `bright`, shape (H, W), are the pixels above half of the height of what shines there.
+    `bright`, shape (H, W), are the pixels above half of the height of what shines there. Overlays are text and squares.
     """
     count, labels, stats, centres = cv2.connectedComponentsWithStats(bright.astype(np.uint8), connectivity=8)
     area = np.zeros(bright.shape, dtype=np.uint8)
     if count > 1:
-        for x0, y0, x1, y1 in _text_lines(labels, stats[1:].astype(np.int64)):
+        for x0, y0, x1, y1 in _overlays(labels, stats[1:].astype(np.int64)) if overlays else ():
             area[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = 1
         for corners in _tools(labels, stats, centres):
             cv2.fillPoly(area, [np.rint(corners).astype(np.int32)], 1)
     return area > 0
 
 
-def _text_lines(labels: np.ndarray, stats: np.ndarray) -> list[tuple[int, int, int, int]]:
-    """Return the boxes of lines of text: left, top, right, bottom."""
+def _overlays(labels: np.ndarray, stats: np.ndarray) -> list[_Corners]:
+    """Return the boxes of text and squares."""
+    left, top, width, height, area = stats.T
+    square = (area >= SOLID * width * height) & (width <= 1.5 * height) & (height <= 2 * width)
+    square &= (height <= CHARACTER_PX[1]) & (width >= CHARACTER_PX[0])
+    single = square & (area >= SOLID_ALONE * width * height) & (np.minimum(width, height) >= SOLID_PX)
+    boxes = np.stack([left, top, left + width, top + height], axis=1)
+    lines = _text_lines(labels, stats, square)
+    return [*lines, *(tuple(box) for box in boxes[single].tolist())]
+
+
+def _text_lines(labels: np.ndarray, stats: np.ndarray, square: Mask) -> list[_Corners]:
+    """Return the boxes of lines of text, in which squares may stand for characters."""
     left, top, width, height, area = stats.T
     low, high = CHARACTER_PX
     fitting = (height >= low) & (height <= high) & (width <= 1.5 * height) & (area <= STROKES * width * height)
     # A thin stroke, as that of the 1, may fill its box.
     fitting |= (height >= low) & (height <= high) & (width <= 0.35 * height)
-    characters = [i for i in np.flatnonzero(fitting).tolist() if _is_thin(labels, stats[i], i + 1)]
+    characters = np.flatnonzero(square).tolist()
+    characters += [i for i in np.flatnonzero(fitting & ~square).tolist() if _is_thin(labels, stats[i], i + 1)]
     characters.sort(key=lambda i: int(left[i]))
     lines: list[list[int]] = []
     for i in characters:
@@ -306,13 +369,56 @@ def _text_lines(labels: np.ndarray, stats: np.ndarray) -> list[tuple[int, int, i
         like = abs(float(np.median(height[line])) - size) <= max(1.0, SLACK * size)
         if line not in sure and like and start - size <= left[line[0]] <= end + size and len(line) >= CHARACTERS - 1:
             sure.append(line)
-    # A row of the block is text from end to end: characters before bright tissue are seen in parts.
-    end = max(int(left[line[-1]] + width[line[-1]]) for line in sure)
-    reach = int(1.5 * size)
+    margin = round(BLANK * size)
+    boxes = [_box(stats, line, margin) for line in sure]
+    # Characters before bright tissue are seen in parts, and thin type in pieces: these stand on the block's rows.
+    rows = _rows(np.array([np.median(top[line]) for line in sure]), size)
+    return boxes + [box for row in rows for box in _on_row(stats, row, size, start, end)]
+
+
+def _rows(tops: Array, size: float) -> Array:
+    """Return the tops of the rows of a block whose lines' tops and characters' height are given; none by one line."""
+    tops = np.sort(tops)
+    gaps = np.diff(tops) / size
+    gaps = gaps[(gaps >= PITCH[0]) & (gaps <= PITCH[1])]
+    if not len(gaps):
+        return np.empty(0)
+    pitch, first = float(np.median(gaps)) * size, float(tops[0])
+    # Lines off the rows, as of another block, are left out.
+    for slack in (OFF_ROW * pitch, SLACK * size):
+        number = np.rint((tops - first) / pitch)
+        on = np.abs(tops - first - number * pitch) <= slack
+        if np.ptp(number[on]) > 0:
+            pitch, first = (float(value) for value in np.polyfit(number[on], tops[on], 1))
+    return np.asarray(first + pitch * np.arange(number.min() - ROWS_BEYOND, number.max() + ROWS_BEYOND + 1))
+
+
+def _on_row(stats: np.ndarray, row: float, size: float, start: int, end: int) -> list[_Corners]:
+    """Return the boxes of what is written on a row of a block of text: its pieces, between which are no wide gaps."""
+    left, top, width, height, _ = stats.T
+    bottom = top + height
+    inside = (top >= row - 2) & (bottom <= row + size + 2) & (width <= 1.5 * size)
+    at_ends = (np.abs(top - row) <= ON_ROW_PX) | (np.abs(bottom - row - size) <= ON_ROW_PX)
+    groups: list[list[int]] = []
+    right = -np.inf
+    for i in sorted(np.flatnonzero(inside).tolist(), key=lambda i: int(left[i])):
+        if left[i] - right > size:
+            groups.append([])
+        groups[-1].append(i)
+        right = max(right if len(groups[-1]) > 1 else 0, int(left[i] + width[i]))
     return [
-        (start - reach, int(np.min(top[line])) - 2, end + reach, int(np.max(top[line] + height[line])) + 2)
-        for line in sure
+        _box(stats, g, 2)
+        for g in groups
+        if start - size <= left[g].min() <= end + size and np.count_nonzero(at_ends[g]) >= CHARACTERS
     ]
+
+
+def _box(stats: np.ndarray, parts: list[int], margin: int) -> _Corners:
+    """Return the box around components, with a margin at its ends."""
+    left, top, width, height, _ = stats[parts].T
+    return (
+        int(left.min()) - margin, int(top.min()) - 2, int((left + width).max()) + margin, int((top + height).max()) + 2
+    )  # fmt: skip
 
 
 def _is_thin(labels: np.ndarray, box: np.ndarray, number: int) -> bool:

@@ -78,6 +78,8 @@ class Options:
         What the field of view spans; "view": the round view in the picture, whose centre is then the principal point.
     poses : Path, optional
         Of the camera over the frames of a sequence: tells convex from concave (`simtest.reconstruction.motion`).
+    keep_overlays : bool
+        Found by colour, take text and squares that are drawn on the picture for tissue.
     """
 
     camera: Path | None = None
@@ -91,6 +93,7 @@ class Options:
     target: Target = "fine"
     fov_of: Extent = "width"
     poses: Path | None = None
+    keep_overlays: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.detector, str) and self.detector != AUTO:
@@ -227,13 +230,13 @@ def choose(
     given = options.detector
     if given is None:
         given = AUTO if is_picture else "peaks"
-    name, finder = _choose_detector(given, image, known, options.roi is not None, not options.every)
+    name, finder = _choose_detector(given, image, known, options.roi is not None, options)
     smoothing = options.smoothing_px
     if smoothing is None:
         smoothing = SMOOTHING_BY_COLOUR_PX if isinstance(finder, ColourDetector) else DEFAULT_SMOOTHING_PX
     if options.roi is not None:
         # A region of interest is cut as by peaks; its neighbours are those that would be found without it.
-        _, finder = _choose_detector(given, image, known, False, not options.every)
+        _, finder = _choose_detector(given, image, known, False, options)
     estimators = options.estimators
     if estimators is None:
         estimators = default_estimators(known) if is_picture else DEFAULT_ESTIMATORS
@@ -279,22 +282,25 @@ def complete(calibration: Calibration, encoding: str | None) -> Calibration:
 
 
 def _choose_detector(
-    given: str | Detector, picture: Image, calibration: Calibration, has_roi: bool, isolated: bool
+    given: str | Detector, picture: Image, calibration: Calibration, has_roi: bool, options: Options
 ) -> tuple[str, Detector]:
     """Return the name of a picture's detector, and the detector; the package's own find isolated highlights, or all.
 
     Where a region of interest is named nothing is detected. Raises `InputError` where the detector does not fit.
     """
+    isolated, keep = not options.every, options.keep_overlays
     if isinstance(given, str) and given == AUTO:
         linear = calibration.response is not None and calibration.response.kind == "linear"
         by_colour = is_coloured(picture) and not linear and not has_roi
-        return ("colour", ColourDetector(isolated)) if by_colour else ("peaks", PeakDetector(isolated))
+        return ("colour", ColourDetector(isolated, keep)) if by_colour else ("peaks", PeakDetector(isolated))
     name, finder = given if isinstance(given, str) else type(given).__qualname__, load_detector(given)
     if has_roi and not isinstance(finder, PeakDetector):
         raise InputError(f"detector {name}: the region of interest is named; must be peaks")
     if isinstance(finder, ColourDetector) and (picture.ndim != 3 or picture.shape[2] != 3):
         raise InputError(f"detector {name}: the picture is grey; must be peaks")
     # A detector that is given, or another package's, decides by itself what it takes.
-    if isinstance(given, str) and isinstance(finder, ColourDetector | PeakDetector):
+    if isinstance(given, str) and isinstance(finder, ColourDetector):
+        finder = replace(finder, isolated=isolated, keep_overlays=keep)
+    elif isinstance(given, str) and isinstance(finder, PeakDetector):
         finder = replace(finder, isolated=isolated)
     return name, finder

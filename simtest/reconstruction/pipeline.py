@@ -56,6 +56,7 @@ def reconstruct(
     detector: str | Detector | None = None,
     target: Target = "fine",
     encoding: str | None = None,
+    keep_overlays: bool = False,
 ) -> Specularities:
     """Reconstruct the normals at a frame's isolated specularities.
 
@@ -94,6 +95,8 @@ def reconstruct(
     encoding : {"srgb", "linear"}, optional
         How the values are encoded, where the calibration does not state the response. Real numbers in [0, 1] are a
         picture too where they are said to be "srgb".
+    keep_overlays : bool
+        Found by colour, take text and squares that are drawn on the picture for tissue; default: they are masked.
 
     Returns
     -------
@@ -129,8 +132,9 @@ def reconstruct(
     elif not isinstance(camera, Calibration):
         raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera or simtest.Calibration")
     check_encoding(encoding, camera)
-    if not isinstance(isolated, bool | np.bool_):
-        raise InputError(f"isolated is a {type(isolated).__name__}: must be True or False")
+    for key, value in (("isolated", isolated), ("keep_overlays", keep_overlays)):
+        if not isinstance(value, bool | np.bool_):
+            raise InputError(f"{key} is a {type(value).__name__}: must be True or False")
     if name:
         image, is_picture = np.asarray(frame), True
         check_size(image, camera.camera)
@@ -138,7 +142,7 @@ def reconstruct(
         image, is_picture = check_frame(frame, camera.camera, encoding)
     options = Options(
         estimators=estimators, roi=roi, encoding=encoding, every=not isolated, detector=detector,
-        smoothing_px=smoothing_px, target=target,
+        smoothing_px=smoothing_px, target=target, keep_overlays=bool(keep_overlays),
     )  # fmt: skip
     spots = run(image, camera, options, is_picture)
     spots.image, spots.warnings = name, cautions

@@ -169,9 +169,45 @@ def test_text_is_looked_for_before_spots_go_that_do_not_stand_out(monkeypatch):
     """It is known by whole lines."""
     asked = []
     monkeypatch.setattr(colour_detection, "_stands_out", lambda *_: False)
-    monkeypatch.setattr(colour_detection, "find_foreign", lambda bright: asked.append(bright) or np.zeros_like(bright))
+    monkeypatch.setattr(
+        colour_detection, "find_foreign", lambda bright, *_: asked.append(bright) or np.zeros_like(bright)
+    )
     assert kinds(lobe(160, 120, 6.0)) == []
     assert asked[0][120, 160]
+
+
+GLYPHS = {"0": "111101101101111", "1": "010010010010010", "7": "111001001001001", ":": "000000010000010",
+          "/": "001001010100100", "e": "000111101110111"}  # fmt: skip
+
+
+def drawn_on(values):
+    """What a scope writes on a picture: full rows, short ones, squares that hide a name, a cursor."""
+    for row, line in enumerate(("7e:", "10/07/1071", "11:07:01", "00:17:10", "", "7/1")):
+        for column, character in enumerate(line):
+            bits = np.array(list(GLYPHS[character]), dtype=int).reshape(5, 3)
+            part = values[30 + 20 * row : 40 + 20 * row, 10 + 9 * column : 16 + 9 * column]
+            part[np.kron(bits, np.ones((2, 2))) > 0] = 0.9
+    for x in (10, 26, 42, 66, 82, 98):
+        values[109:121, x : x + 12] = 0.9
+    values[200:213, 200:210] = 0.9
+    return values
+
+
+def test_text_and_squares_are_no_highlights_unless_they_are_kept():
+    values = np.rint(255 * drawn_on(picture(lobe(250, 180, 5.0)))).astype(np.uint8)
+    made = [reconstruct(values, CAMERA, {}, keep_overlays=keep, **BY_COLOUR) for keep in (False, True)]
+    shown, kept = ({h.region.peak for h in each.detection.highlights} for each in made)
+    assert {np.hypot(x - 249.5, y - 179.5) < 3 for x, y in shown} == {True}
+    assert shown < kept
+    for left, top, right, bottom in ((0, 25, 50, 45), (0, 108, 115, 122), (0, 128, 50, 145), (200, 200, 210, 213)):
+        assert any(left <= x < right and top <= y < bottom for x, y in kept), (left, top)
+
+
+def test_highlights_beside_text_and_below_it_are_not_text():
+    spots = lobe(150, 56, 2.0) + lobe(20, 215, 2.0) + lobe(30, 216, 2.0)
+    found = [h.region.peak for h in detect_in_picture(drawn_on(picture(spots))).detection.highlights]
+    for x, y in ((150, 56), (20, 215), (30, 216)):
+        assert min(np.hypot(x - 0.5 - p[0], y - 0.5 - p[1]) for p in found) < 2, (x, y)
 
 
 def test_normals_of_a_sphere_point_back_along_the_sightlines():
@@ -271,6 +307,33 @@ def test_cut_corners_are_found(cut):
     assert view.circle is None
     assert not (view.seen & ~inside).any()
     assert np.count_nonzero(view.seen) > 0.9 * np.count_nonzero(inside)
+
+
+@pytest.mark.parametrize("cut", [50, 0])
+@pytest.mark.parametrize("box", [(0, 150, 110, 90), (20, 170, 130, 24), (100, 80, 60, 40)])
+def test_a_box_of_one_colour_hides_the_tissue(cut, box):
+    (x, y), (left, top, width, height) = places(), box
+    inside = np.minimum(x, WIDTH - x) + np.minimum(y, HEIGHT - y) > cut
+    frame = framed(inside)
+    frame[top : top + height, left : left + width] = (0.0, 0.2, 0.63)
+    frame[top + 8 : top + 14, left + 10 : left + 40 : 4] = 0.9
+    seen = find_view(frame).seen
+    assert not seen[top : top + height, left : left + width].any()
+    inside[top : top + height, left : left + width] = False
+    assert np.count_nonzero(seen) > 0.95 * np.count_nonzero(inside)
+
+
+def test_a_view_of_tissue_that_is_green_as_under_narrow_band_light_is_no_box():
+    assert find_view(picture(np.zeros((HEIGHT, WIDTH)), tissue=TISSUE[::-1])).seen is None
+
+
+def test_a_dent_of_a_straight_border_is_outside_the_view():
+    x, y = places()
+    inside = np.minimum(x, WIDTH - x) + np.minimum(y, HEIGHT - y) > 50
+    inside[100:120, :16] = False
+    view = find_view(framed(inside))
+    assert view.circle is None
+    assert not (view.seen & ~inside).any()
 
 
 def test_whole_pictures_and_organs_before_the_dark_have_no_border():

@@ -12,6 +12,7 @@ from simtest.reconstruction import reconstruct
 from simtest.rendering import Session
 from simtest.spec import load_scene
 from studies.detection.frames import SPLITS, study_frames
+from studies.detection.overlays import OverlayCounts, overlay_counts
 from studies.detection.real_frames import inside_outlines, outlined_frames, score_frame
 from studies.detection.tissue import Counts, detected_peaks
 from studies.detection.tissue import score_frame as score_tissue
@@ -87,6 +88,17 @@ def test_outlined_frames_are_covered_and_nothing_else_is_marked(shared_data):
     assert np.nanmedian([made.covered for made in scores.values()]) >= 0.8
     assert np.nanmedian([made.iou for made in scores.values()]) >= 0.65
     assert np.nanmin([made.covered for made in scores.values()]) >= 0.55
+
+
+def test_few_answers_stand_on_what_is_drawn_and_little_tissue_is_hidden(shared_data):
+    """Frames that were developed on; the manual has the figures of the others."""
+    counts = [made for _, developed_on, made in overlay_counts(shared_data / "frames" / "kvasir") if developed_on]
+    if not counts:
+        pytest.skip("no frames in ../shared/data/frames/kvasir")
+    made = sum(counts, OverlayCounts())
+    assert made.kept_on_overlays > 0.15 * made.kept
+    assert made.on_overlays <= 0.01 * made.answered
+    assert made.hidden <= 0.01 * made.tissue
 
 
 def highlight(x, y, radius, *more):
