@@ -14,8 +14,7 @@ from simtest.estimators.highlight import Fitted, OfHighlight, fit_highlight, of_
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate, Law
 from simtest.estimators.small_spots import SmallSpot
-from simtest.geometry import Array, Camera, Patch
-from simtest.geometry.patch import slope_divisor_px2
+from simtest.geometry import Camera, Patch
 from simtest.runtime.fitted import fitted_number
 
 OF_APEX = AxisErrors(fitted_number("ripples.brightest"), OF_MEAN.bends, fitted_number("ripples.brightest_px2"))
@@ -73,20 +72,7 @@ def budget_of_peak(family: IsophoteFamily) -> Budget | None:
     """Return the budget of the peak in the family's basis, which differs from the peak's by a few degrees at most."""
     if family.axes_covariance is None:
         return None
-    gap = family.basis @ (family.peak_axis - family.camera.unproject(family.patch.peak_px))
-    return family.budget(_noise(family), OF_APEX, GAP_SHARE * np.outer(gap, gap))
-
-
-def _noise(family: IsophoteFamily) -> Array:
-    """Return the covariance of the peak by the sensor's noise, shape (2, 2), rad^2.
-
-    The peak lies where the smoothed noise's slope balances that of the lobe, I0 / V, with V the second moments of the
-    smoothed lobe.
-    """
-    patch = family.patch
-    slope = (patch.noise_at_peak or 0.0) / (slope_divisor_px2(patch.smoothing_px) * patch.peak_value)
-    lobe = family.seen_moments
-    return np.asarray(slope**2 * lobe @ np.linalg.solve(family.px2, lobe))
+    return family.budget(family.peak_noise, OF_APEX, GAP_SHARE * np.outer(family.gap, family.gap))
 
 
 brightest_point = BrightestPoint()

@@ -4,9 +4,11 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
+import numpy as np
+
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
-from simtest.errors import Failure
+from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget
 from simtest.estimators.family import IsophoteFamily, fit_isophote_families
 from simtest.estimators.isophotes import FittedIsophote, fit_isophote_of_each
@@ -14,8 +16,12 @@ from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate
 from simtest.estimators.small_spots import HighlightAxis, SmallSpot, fit_small_spots, is_small
 from simtest.geometry import Array, Camera, Patch
+from simtest.runtime.fitted import fitted_number
 
 Fitted = HighlightAxis | Failure
+
+OFF_PEAK = "off_peak"  # flag of estimates at a peak that the isophotes do not lead to
+AT_PEAK = fitted_number("off_peak.budget")
 
 
 @dataclass(frozen=True)
@@ -79,9 +85,27 @@ def fit_highlights(patches: Sequence[Patch], camera: Camera, isovalues: Sequence
         if spot is None and _recall(patch, name, camera) is _NOTHING
     ]
     for patch, family in zip(pending, fit_isophote_families(pending, camera, isovalues), strict=True):
-        _keep(patch, name, camera, family)
+        _keep(patch, name, camera, look_at_peak(family))
     fitted = (_recall(patch, name, camera) for patch in patches)
-    return [spot or cast(IsophoteFamily | Failure, found) for found, spot in zip(fitted, small, strict=True)]
+    return [spot or cast(Fitted, found) for found, spot in zip(fitted, small, strict=True)]
+
+
+def look_at_peak(family: IsophoteFamily | Failure) -> Fitted:
+    """Return a family of isophotes that lead to their peak; else the peak itself, or a Failure where they are cut.
+
+    Isophotes that follow the shading of a body carry no normal. At the peak the normal may still be off by several
+    times the angle by which they miss it, since on a body of radius R it turns d/R times as fast as the sightline.
+    """
+    if isinstance(family, Failure) or family.off_peak <= 1:
+        return family
+    patch, camera = family.patch, family.camera
+    gap_px = float(np.hypot(*(camera.project(family.peak_axis) - patch.peak_px)))
+    if any(isophote.cut for isophote in family.isophotes):
+        detail = f"the isophotes lead {gap_px:.1f} px off the peak, as those of shading do, and the border cuts them"
+        return Failure(Reason.NO_ESTIMATE, detail)
+    to_px = np.linalg.inv(family.basis @ camera.step_of_pixels(patch.peak_px).T)
+    size, noise = (to_px @ each @ to_px.T for each in (family.seen_moments, family.peak_noise))
+    return SmallSpot(patch, camera, patch.peak_px, size, noise, (AT_PEAK * gap_px) ** 2 * np.eye(2), flags=(OFF_PEAK,))
 
 
 def isophote_of_each(

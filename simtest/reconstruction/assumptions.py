@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Calibration, CameraPrior, Priors
-from simtest.calibration.priors import UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, UNTOLD_SLOPE_RAD
+from simtest.calibration.priors import OF_PICTURES, UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, UNTOLD_SLOPE_RAD
 from simtest.detection.view import DARK, View
 from simtest.errors import InputError
 from simtest.estimators.prior_parts import relief_part
@@ -123,12 +123,13 @@ def _guessed(
     return Calibration(camera, priors=Priors(camera=prior))
 
 
-def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumption]:
+def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumption]:  # noqa: C901 - one item each
     """List what is not known exactly of a picture: what its calibration gives with a spread, and what nobody told.
 
     `encoding` is the one that was told beside the calibration, if any. A default of `Priors` counts as told by nobody.
     """
     priors, key = calibration.priors, "in a calibration file"
+    floors, given = priors.open, priors.floors != OF_PICTURES
     made: list[Assumption] = []
 
     def add(what: str, distribution: str, how_to_narrow: str, given: bool = False) -> None:
@@ -140,10 +141,12 @@ def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumpti
     if priors.lights_covariance is not None:
         worst = float(np.sqrt(np.linalg.eigvalsh(priors.lights_covariance)[:, -1].max()))
         spread = f"as given, normal, ± {worst:.2g} mm along the least certain axis"
-        add("light positions", spread, f"[rig] lights_mm and lights_covariance_mm2 {key}", True)
+        how = f"[rig] lights_covariance_mm2 or [uncertainty] light_floor_mm and light_floor_deg {key}"
+        add("light positions", spread, how, bool(priors.lights_covariance_mm2) or given)
     if priors.distance.sd > 0:
-        how = f"[rig] distance_mm or distance_range_mm {key}"
-        add("distance of the tissue", f"{priors.distance} mm along the sightline", how, priors.distance_mm is not None)
+        how = f"[rig] distance_mm or distance_range_mm, or [uncertainty] distance_floor, {key}"
+        as_given = priors.distance == priors.distance_mm or (given and priors.distance_mm is not None)
+        add("distance of the tissue", f"{priors.distance} mm along the sightline", how, as_given)
     camera, prior = calibration.camera, priors.camera
     told = not prior.guessed
     if prior.focal_sd > 0:
@@ -159,6 +162,12 @@ def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumpti
         add("distortion", spread, f"[camera.distortion] and [uncertainty] distortion_sd {key}", told)
     if calibration.response is None and encoding is None:
         add("response", "sRGB, sharpened or not", f"[response] {key}, or --encoding")
+    if floors.response_sd > 0:
+        moved = f"a highlight's centre moved by ± {floors.response_sd:.2g} of its size, as by sharpening or tone curves"
+        add("response under a highlight", moved, f"[uncertainty] response_floor {key}", given)
+    if floors.feature_sd > 0:
+        turned = f"normals turned by ± {math.degrees(floors.feature_sd):.2g} deg an axis"
+        add("features finer than a pixel", turned, f"[uncertainty] feature_floor_deg {key}", given)
     if priors.falloff_power is not None:
         falloff = f"cos^k over the angle from the optical axis, k {priors.falloff_power}"
         how = f"[vignetting] and [emission] {key}, or [uncertainty] falloff_power"
