@@ -10,7 +10,7 @@ from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget
 from simtest.estimators.family import OF_MEAN, AxisErrors, IsophoteFamily, fit_isophote_family
-from simtest.estimators.highlight import Fitted, OfHighlight, fit_highlight, of_spot
+from simtest.estimators.highlight import Fitted, OfHighlight, fit_highlight, look_at_peak, of_spot
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate, Law
 from simtest.estimators.small_spots import SmallSpot
@@ -38,7 +38,7 @@ class BrightestPoint(OfHighlight):
 
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate the normal (see `simtest.estimators.Estimator`)."""
-        whole = fit_highlight(patch, camera, self.isovalues)
+        whole = look_at_peak(fit_highlight(patch, camera, self.isovalues), priors.open.off_peak)
         if isinstance(whole, SmallSpot):
             return of_spot(whole, priors)
         if (cut := _cut_off(patch, whole)) is not None:

@@ -62,7 +62,7 @@ class AxisErrors(NamedTuple):
 OF_MEAN = AxisErrors(fitted_number("ripples.mean"), fitted_number("bends.mean"), fitted_number("drift.mean_grid_px2"))
 OF_PEAK = AxisErrors(fitted_number("ripples.peak"), fitted_number("bends.peak"), fitted_number("drift.peak_grid_px2"))
 
-OFF_PEAK, OFF_PEAK_PX = fitted_number("off_peak.share"), fitted_number("off_peak.px")
+OFF_PEAK_PX = fitted_number("off_peak.px")
 NOISE_SIGMAS = 3.0  # of the gap between axis and peak are noise
 
 STREAK_RATIO = 0.1  # an isophote with a smaller axis ratio is a streak
@@ -157,17 +157,16 @@ class IsophoteFamily(IsophotesAcross):
         """Offset of the axis at the peak from the sightline of the peak's pixels, in the basis, rad, shape (2,)."""
         return np.asarray(self.basis @ (self.peak_axis - self.camera.unproject(self.patch.peak_px)))
 
-    @property
-    def off_peak(self) -> float:
-        """The gap over what the highlight's size, the grid of pixels and noise allow; above 1 the axis is no peak's.
+    def off_peak(self, share: float) -> float:
+        """Return the gap over what the size, the grid of pixels and noise allow; above 1 the axis is not the peak's.
 
         Isophotes of one lobe lead to its peak. Those that follow the shading of a body, or hold several maxima, lead
-        elsewhere, the further the broader they are: so what is allowed is a share of the highlight's size.
+        elsewhere, the further the broader they are: so what is allowed is `share` of the highlight's size.
         """
         size2 = float(np.sqrt(max(np.linalg.det(self.seen_moments), 0.0)))
         pixel2 = float(np.sqrt(np.linalg.det(self.px2)))
         noise = self.peak_noise if self.axes_covariance is None else _summed(self.axes_covariance) + self.peak_noise
-        allowed2 = OFF_PEAK**2 * size2 + OFF_PEAK_PX**2 * pixel2 + NOISE_SIGMAS**2 * float(np.trace(noise))
+        allowed2 = share**2 * size2 + OFF_PEAK_PX**2 * pixel2 + NOISE_SIGMAS**2 * float(np.trace(noise))
         # A clipped peak lies anywhere on its plateau.
         return float(np.sqrt(self.gap @ self.gap / (allowed2 + np.trace(self.clipping))))
 

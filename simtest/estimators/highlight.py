@@ -47,7 +47,7 @@ class OfHighlight:
 
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate the normal (see `simtest.estimators.Estimator`)."""
-        highlight = fit_highlight(patch, camera, self.isovalues)
+        highlight = look_at_peak(fit_highlight(patch, camera, self.isovalues), priors.open.off_peak)
         return highlight if isinstance(highlight, Failure) else self.of(highlight, priors)
 
     def of(self, highlight: HighlightAxis, priors: Priors) -> Estimate | Failure:
@@ -85,18 +85,19 @@ def fit_highlights(patches: Sequence[Patch], camera: Camera, isovalues: Sequence
         if spot is None and _recall(patch, name, camera) is _NOTHING
     ]
     for patch, family in zip(pending, fit_isophote_families(pending, camera, isovalues), strict=True):
-        _keep(patch, name, camera, look_at_peak(family))
+        _keep(patch, name, camera, family)
     fitted = (_recall(patch, name, camera) for patch in patches)
-    return [spot or cast(Fitted, found) for found, spot in zip(fitted, small, strict=True)]
+    return [spot or cast(IsophoteFamily | Failure, found) for found, spot in zip(fitted, small, strict=True)]
 
 
-def look_at_peak(family: IsophoteFamily | Failure) -> Fitted:
+def look_at_peak(family: Fitted, share: float) -> Fitted:
     """Return a family of isophotes that lead to their peak; else the peak itself, or a Failure where they are cut.
 
     Isophotes that follow the shading of a body carry no normal. At the peak the normal may still be off by several
     times the angle by which they miss it, since on a body of radius R it turns d/R times as fast as the sightline.
+    `share`: see `IsophoteFamily.off_peak`; 0 leaves the family as it is.
     """
-    if isinstance(family, Failure) or family.off_peak <= 1:
+    if not share > 0 or not isinstance(family, IsophoteFamily) or family.off_peak(share) <= 1:
         return family
     patch, camera = family.patch, family.camera
     gap_px = float(np.hypot(*(camera.project(family.peak_axis) - patch.peak_px)))

@@ -9,7 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Calibration, CameraPrior, Priors
-from simtest.calibration.priors import OF_PICTURES, UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, UNTOLD_SLOPE_RAD
+from simtest.calibration.priors import (
+    OF_PICTURES,
+    UNTOLD_FALLOFF_POWER,
+    UNTOLD_OFFSET_MM,
+    UNTOLD_SLOPE_RAD,
+    Floors,
+)
 from simtest.detection.view import DARK, View
 from simtest.errors import InputError
 from simtest.estimators.prior_parts import relief_part
@@ -123,7 +129,7 @@ def _guessed(
     return Calibration(camera, priors=Priors(camera=prior))
 
 
-def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumption]:  # noqa: C901 - one item each
+def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumption]:
     """List what is not known exactly of a picture: what its calibration gives with a spread, and what nobody told.
 
     `encoding` is the one that was told beside the calibration, if any. A default of `Priors` counts as told by nobody.
@@ -162,12 +168,7 @@ def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumpti
         add("distortion", spread, f"[camera.distortion] and [uncertainty] distortion_sd {key}", told)
     if calibration.response is None and encoding is None:
         add("response", "sRGB, sharpened or not", f"[response] {key}, or --encoding")
-    if floors.response_sd > 0:
-        moved = f"a highlight's centre moved by ± {floors.response_sd:.2g} of its size, as by sharpening or tone curves"
-        add("response under a highlight", moved, f"[uncertainty] response_floor {key}", given)
-    if floors.feature_sd > 0:
-        turned = f"normals turned by ± {math.degrees(floors.feature_sd):.2g} deg an axis"
-        add("features finer than a pixel", turned, f"[uncertainty] feature_floor_deg {key}", given)
+    made += _of_normals(floors, given)
     if priors.falloff_power is not None:
         falloff = f"cos^k over the angle from the optical axis, k {priors.falloff_power}"
         how = f"[vignetting] and [emission] {key}, or [uncertainty] falloff_power"
@@ -180,6 +181,17 @@ def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumpti
     if not priors.plane:
         made.append(NEAR_MISSES)
     return made
+
+
+def _of_normals(floors: Floors, given: bool) -> list[Assumption]:
+    """List the floors of each normal."""
+    moved, turned = f"± {floors.response_sd:.2g} of its size", f"± {math.degrees(floors.feature_sd):.2g} deg an axis"
+    each = (
+        ("response, for a highlight's centre", floors.response_sd, moved, "response_floor"),
+        ("features finer than a pixel, for the normal", floors.feature_sd, turned, "feature_floor_deg"),
+    )
+    how = "[uncertainty] {} in a calibration file"
+    return [Assumption(what, spread, how.format(key), given) for what, sd, spread, key in each if sd > 0]
 
 
 def light_note(assumed: Iterable[Assumption]) -> str:

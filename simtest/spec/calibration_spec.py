@@ -122,7 +122,7 @@ Floor = Annotated[float | None, Field(ge=0, le=100)]
 FLOORS = {
     "light_sd_mm": ("light_floor_mm", None), "light_sd": ("light_floor_deg", "deg"),
     "distance_sd": ("distance_floor", None), "feature_sd": ("feature_floor_deg", "deg"),
-    "response_sd": ("response_floor", None),
+    "response_sd": ("response_floor", None), "off_peak": ("off_peak", None),
 }  # fmt: skip
 """Key and unit of each number of `Floors`."""
 
@@ -158,6 +158,11 @@ class UncertaintyCalibration(Spec):
     )
     response_floor: Floor = Field(
         None, description="of a highlight's centre by the response, share of its size; default in pictures 0.05"
+    )
+    off_peak: Floor = Field(
+        None,
+        description="an answer that looks farther off its peak than this share of its highlight's size is given at the "
+        "peak or refused; default in pictures 0.05, 0: none is",
     )
 
     @property
