@@ -21,7 +21,7 @@ from simtest.runtime.fitted import fitted_number
 Fitted = HighlightAxis | Failure
 
 OFF_PEAK = "off_peak"  # flag of estimates at a peak that the isophotes do not lead to
-AT_PEAK = fitted_number("off_peak.budget")
+BY_GAP, BY_SIZE = fitted_number("off_peak.by_gap"), fitted_number("off_peak.by_size")
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,9 @@ def look_at_peak(family: Fitted, share: float) -> Fitted:
         return Failure(Reason.NO_ESTIMATE, detail)
     to_px = np.linalg.inv(family.basis @ camera.step_of_pixels(patch.peak_px).T)
     size, noise = (to_px @ each @ to_px.T for each in (family.seen_moments, family.peak_noise))
-    return SmallSpot(patch, camera, patch.peak_px, size, noise, (AT_PEAK * gap_px) ** 2 * np.eye(2), flags=(OFF_PEAK,))
+    # The shading moves the peak too, the more the broader the highlight is.
+    shape = (BY_GAP * gap_px) ** 2 * np.eye(2) + BY_SIZE**2 * size
+    return SmallSpot(patch, camera, patch.peak_px, size, noise, shape, flags=(OFF_PEAK,))
 
 
 def isophote_of_each(
