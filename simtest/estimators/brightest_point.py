@@ -38,7 +38,7 @@ class BrightestPoint(OfHighlight):
 
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate the normal (see `simtest.estimators.Estimator`)."""
-        whole = look_at_peak(fit_highlight(patch, camera, self.isovalues), priors.open.off_peak)
+        whole = look_at_peak(fit_highlight(patch, camera, self.isovalues), priors)
         if isinstance(whole, SmallSpot):
             return of_spot(whole, priors)
         if (cut := _cut_off(patch, whole)) is not None:
