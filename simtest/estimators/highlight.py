@@ -21,7 +21,6 @@ from simtest.runtime.fitted import fitted_number
 
 Fitted = HighlightAxis | Failure
 
-OFF_PEAK = "off_peak"  # flag of estimates at a peak that the isophotes do not lead to
 BY_GAP, BY_SIZE = fitted_number("off_peak.by_gap"), fitted_number("off_peak.by_size")
 
 
@@ -114,7 +113,7 @@ def look_at_peak(family: Fitted, priors: Priors) -> Fitted:
     )
     pixel2 = float(np.sqrt(np.linalg.det(family.px2)))
     shape = ((BY_GAP * gap_px) ** 2 + facing2 / 2 / pixel2) * np.eye(2) + BY_SIZE**2 * size
-    return SmallSpot(patch, camera, patch.peak_px, size, noise, shape, flags=(OFF_PEAK,))
+    return SmallSpot(patch, camera, patch.peak_px, size, noise, shape, flags=("off_peak",))
 
 
 def _facing(sightline: Array, light: Array, priors: Priors) -> float:
