@@ -14,6 +14,7 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.geometry.checks import check_kind, check_number
 from simtest.runtime.arrays import Array, short_repr
+from simtest.runtime.fitted import fitted_number
 
 LEAST_SHARE = 0.05
 """A Normal that stands for something positive is cut off at this share of its mean."""
@@ -221,6 +222,57 @@ class CameraPrior:
 
 
 @dataclass(frozen=True)
+class Floors:
+    """What is left open of a picture however well it is calibrated; the default is nothing, as of a render.
+
+    Parameters
+    ----------
+    light_sd_mm, light_sd : float
+        Standard deviation an axis of the position of a light that is given without a covariance: mm, and rad as seen
+        from the camera.
+    distance_sd : float
+        Least standard deviation of a given distance, as a share of it.
+    feature_sd : float
+        Standard deviation an axis of the normal by features finer than a pixel, rad.
+    response_sd : float
+        Standard deviation of a highlight's centre by a response that is not the assumed one, such as sharpening, as a
+        share of the highlight's size.
+    off_peak : float
+        An answer that looks farther off its peak than this share of its highlight's size, beyond pixels and noise, is
+        given at the peak, with the distance in its budget, or refused; 0: none is.
+
+    Raises
+    ------
+    InputError
+        If a number is not finite or negative.
+    """
+
+    light_sd_mm: float = 0.0
+    light_sd: float = 0.0
+    distance_sd: float = 0.0
+    feature_sd: float = 0.0
+    response_sd: float = 0.0
+    off_peak: float = 0.0
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            check_number(each.name, getattr(self, each.name), least=0)
+
+
+NO_FLOORS = Floors()
+
+OF_PICTURES = Floors(
+    fitted_number("floors.light_mm"),
+    math.radians(fitted_number("floors.light_deg")),
+    fitted_number("floors.distance"),
+    math.radians(fitted_number("floors.feature_deg")),
+    fitted_number("floors.response"),
+    fitted_number("off_peak.share"),
+)
+"""The floors of pictures that give none."""
+
+
+@dataclass(frozen=True)
 class Priors:
     """What estimators are told beside the picture and the camera, and how what they are not told is distributed.
 
@@ -245,7 +297,10 @@ class Priors:
     plane : bool
         Whether the surface is known to be a plane, as `circle_pose` takes it to be.
     lights_covariance_mm2 : tuple
-        Covariance of each light's position, three rows of three numbers a light, mm^2; empty: the positions are exact.
+        Covariance of each light's position, three rows of three numbers a light, mm^2; empty: not given, so that the
+        floor holds, or else the positions are exact.
+    floors : Floors, optional
+        What stays open whatever else is given; None: not given, which is `OF_PICTURES` in pictures, and nothing else.
 
     Raises
     ------
@@ -262,6 +317,7 @@ class Priors:
     relief_slope: Distribution = UNTOLD_SLOPE_RAD
     plane: bool = False
     lights_covariance_mm2: tuple[Matrix, ...] = ()
+    floors: Floors | None = None
 
     __repr__ = short_repr
 
@@ -278,6 +334,8 @@ class Priors:
             if (prior := getattr(self, name)) is not None or name != "falloff_power":
                 check_distribution(name, prior, least=0)
         check_kind("priors camera", self.camera, CameraPrior)
+        if self.floors is not None:
+            check_kind("priors floors", self.floors, Floors)
 
     @cached_property
     def lights(self) -> Array:
@@ -292,15 +350,24 @@ class Priors:
     @cached_property
     def lights_covariance(self) -> Array | None:
         """Covariances of the lights' positions, shape (L, 3, 3), mm^2; None where the positions are exact."""
-        if not self.lights_covariance_mm2:
-            return None
         covariances = np.array(self.lights_covariance_mm2, dtype=float)
+        if not self.lights_covariance_mm2:
+            # a light that is given without a covariance has that of the floors
+            across = self.open.light_sd * np.linalg.norm(self.lights, axis=1)
+            covariances = (self.open.light_sd_mm**2 + across**2)[:, None, None] * np.eye(3)
         return covariances if covariances.any() else None
 
-    @property
+    @cached_property
     def distance(self) -> Distribution:
-        """The told working distance along the sightline, mm, or else the working range of endoscopes."""
-        return UNTOLD_DISTANCE_MM if self.distance_mm is None else self.distance_mm
+        """The working distance along the sightline, mm: as given, no surer than its floor, or that of endoscopes."""
+        given = UNTOLD_DISTANCE_MM if self.distance_mm is None else self.distance_mm
+        least = self.open.distance_sd * given.mean
+        return Normal(given.mean, least) if given.sd < least else given
+
+    @property
+    def open(self) -> Floors:
+        """The floors, 0 where none are given."""
+        return self.floors or NO_FLOORS
 
 
 def check_light_covariances(covariances: tuple[Matrix, ...], count: int) -> None:

@@ -10,12 +10,11 @@ from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget
 from simtest.estimators.family import OF_MEAN, AxisErrors, IsophoteFamily, fit_isophote_family
-from simtest.estimators.highlight import Fitted, OfHighlight, fit_highlight, of_spot
+from simtest.estimators.highlight import Fitted, OfHighlight, fit_highlight, look_at_peak, of_spot
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate, Law
 from simtest.estimators.small_spots import SmallSpot
-from simtest.geometry import Array, Camera, Patch
-from simtest.geometry.patch import slope_divisor_px2
+from simtest.geometry import Camera, Patch
 from simtest.runtime.fitted import fitted_number
 
 OF_APEX = AxisErrors(fitted_number("ripples.brightest"), OF_MEAN.bends, fitted_number("ripples.brightest_px2"))
@@ -39,7 +38,7 @@ class BrightestPoint(OfHighlight):
 
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate the normal (see `simtest.estimators.Estimator`)."""
-        whole = fit_highlight(patch, camera, self.isovalues)
+        whole = look_at_peak(fit_highlight(patch, camera, self.isovalues), priors)
         if isinstance(whole, SmallSpot):
             return of_spot(whole, priors)
         if (cut := _cut_off(patch, whole)) is not None:
@@ -73,20 +72,7 @@ def budget_of_peak(family: IsophoteFamily) -> Budget | None:
     """Return the budget of the peak in the family's basis, which differs from the peak's by a few degrees at most."""
     if family.axes_covariance is None:
         return None
-    gap = family.basis @ (family.peak_axis - family.camera.unproject(family.patch.peak_px))
-    return family.budget(_noise(family), OF_APEX, GAP_SHARE * np.outer(gap, gap))
-
-
-def _noise(family: IsophoteFamily) -> Array:
-    """Return the covariance of the peak by the sensor's noise, shape (2, 2), rad^2.
-
-    The peak lies where the smoothed noise's slope balances that of the lobe, I0 / V, with V the second moments of the
-    smoothed lobe.
-    """
-    patch = family.patch
-    slope = (patch.noise_at_peak or 0.0) / (slope_divisor_px2(patch.smoothing_px) * patch.peak_value)
-    lobe = family.seen_moments
-    return np.asarray(slope**2 * lobe @ np.linalg.solve(family.px2, lobe))
+    return family.budget(family.peak_noise, OF_APEX, GAP_SHARE * np.outer(family.gap, family.gap))
 
 
 brightest_point = BrightestPoint()

@@ -38,7 +38,7 @@ from simtest.estimators.isophotes import (
 )
 from simtest.geometry import Array, Camera, CirclePose, Mask, Patch, circle_poses, cone_axes
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
-from simtest.geometry.patch import share_of_noise
+from simtest.geometry.patch import share_of_noise, slope_divisor_px2
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.fitted import fitted_number
 
@@ -61,6 +61,9 @@ class AxisErrors(NamedTuple):
 
 OF_MEAN = AxisErrors(fitted_number("ripples.mean"), fitted_number("bends.mean"), fitted_number("drift.mean_grid_px2"))
 OF_PEAK = AxisErrors(fitted_number("ripples.peak"), fitted_number("bends.peak"), fitted_number("drift.peak_grid_px2"))
+
+OFF_PEAK_PX = fitted_number("off_peak.px")
+NOISE_SIGMAS = 3.0  # of the gap between axis and peak are noise
 
 STREAK_RATIO = 0.1  # an isophote with a smaller axis ratio is a streak
 MIN_CLIPPED_PX = 3  # fewer clipped pixels change a smoothed peak by less than its noise
@@ -148,6 +151,35 @@ class IsophoteFamily(IsophotesAcross):
         """The axis extrapolated to the lobe's peak before smoothing, unit, shape (3,), camera frame."""
         axis = self.axis + self.drift @ self.basis
         return np.asarray(axis / np.linalg.norm(axis))
+
+    @cached_property
+    def gap(self) -> Array:
+        """Offset of the axis at the peak from the sightline of the peak's pixels, in the basis, rad, shape (2,)."""
+        return np.asarray(self.basis @ (self.peak_axis - self.camera.unproject(self.patch.peak_px)))
+
+    def off_peak(self, share: float) -> float:
+        """Return the gap over what the size, the grid of pixels and noise allow; above 1 the axis is not the peak's.
+
+        Isophotes of one lobe lead to its peak. Those that follow the shading of a body, or hold several maxima, lead
+        elsewhere, the further the broader they are: so what is allowed is `share` of the highlight's size.
+        """
+        size2 = float(np.sqrt(max(np.linalg.det(self.seen_moments), 0.0)))
+        pixel2 = float(np.sqrt(np.linalg.det(self.px2)))
+        noise = self.peak_noise if self.axes_covariance is None else _summed(self.axes_covariance) + self.peak_noise
+        allowed2 = share**2 * size2 + OFF_PEAK_PX**2 * pixel2 + NOISE_SIGMAS**2 * float(np.trace(noise))
+        # A clipped peak lies anywhere on its plateau.
+        return float(np.sqrt(self.gap @ self.gap / (allowed2 + np.trace(self.clipping))))
+
+    @property
+    def peak_noise(self) -> Array:
+        """Covariance of the highest pixel's place by the sensor's noise, shape (2, 2), rad^2.
+
+        The peak lies where the smoothed noise's slope balances that of the lobe, I0 / V, with V the second moments of
+        the smoothed lobe.
+        """
+        patch, lobe = self.patch, self.seen_moments
+        slope = (patch.noise_at_peak or 0.0) / (slope_divisor_px2(patch.smoothing_px) * patch.peak_value)
+        return np.asarray(slope**2 * lobe @ np.linalg.solve(self.px2, lobe))
 
     @property
     def drift_is_real(self) -> bool:

@@ -4,9 +4,12 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
+import numpy as np
+
 from simtest.calibration import NO_PRIORS, Priors
+from simtest.calibration.priors import AT_CAMERA_MM
 from simtest.conventions import CONE_AXIS_ISOVALUES
-from simtest.errors import Failure
+from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget
 from simtest.estimators.family import IsophoteFamily, fit_isophote_families
 from simtest.estimators.isophotes import FittedIsophote, fit_isophote_of_each
@@ -14,8 +17,11 @@ from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate
 from simtest.estimators.small_spots import HighlightAxis, SmallSpot, fit_small_spots, is_small
 from simtest.geometry import Array, Camera, Patch
+from simtest.runtime.fitted import fitted_number
 
 Fitted = HighlightAxis | Failure
+
+BY_GAP, BY_SIZE = fitted_number("off_peak.by_gap"), fitted_number("off_peak.by_size")
 
 
 @dataclass(frozen=True)
@@ -41,7 +47,7 @@ class OfHighlight:
 
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate the normal (see `simtest.estimators.Estimator`)."""
-        highlight = fit_highlight(patch, camera, self.isovalues)
+        highlight = look_at_peak(fit_highlight(patch, camera, self.isovalues), priors)
         return highlight if isinstance(highlight, Failure) else self.of(highlight, priors)
 
     def of(self, highlight: HighlightAxis, priors: Priors) -> Estimate | Failure:
@@ -82,6 +88,39 @@ def fit_highlights(patches: Sequence[Patch], camera: Camera, isovalues: Sequence
         _keep(patch, name, camera, family)
     fitted = (_recall(patch, name, camera) for patch in patches)
     return [spot or cast(IsophoteFamily | Failure, found) for found, spot in zip(fitted, small, strict=True)]
+
+
+def look_at_peak(family: Fitted, priors: Priors) -> Fitted:
+    """Return a family of isophotes that lead to their peak; else the peak itself, or a Failure where they are cut.
+
+    Isophotes that follow the shading of a body carry no normal. At the peak the normal may still be off by several
+    times the angle by which they miss it, since on a body of radius R it turns d/R times as fast as the sightline.
+    What shines there may also be the shading's maximum, which faces a given light instead of bisecting.
+    """
+    share = priors.open.off_peak
+    if not share > 0 or not isinstance(family, IsophoteFamily) or family.off_peak(share) <= 1:
+        return family
+    patch, camera = family.patch, family.camera
+    gap_px = float(np.hypot(*(camera.project(family.peak_axis) - patch.peak_px)))
+    if any(isophote.cut for isophote in family.isophotes):
+        detail = f"the isophotes lead {gap_px:.1f} px off the peak, as those of shading do, and the border cuts them"
+        return Failure(Reason.NO_ESTIMATE, detail)
+    to_px = np.linalg.inv(family.basis @ camera.step_of_pixels(patch.peak_px).T)
+    size, noise = (to_px @ each @ to_px.T for each in (family.seen_moments, family.peak_noise))
+    # The shading moves the peak too, the more the broader the highlight is.
+    facing2 = max(
+        (_facing(camera.unproject(patch.peak_px), light, priors) ** 2 for light in priors.lights), default=0.0
+    )
+    pixel2 = float(np.sqrt(np.linalg.det(family.px2)))
+    shape = ((BY_GAP * gap_px) ** 2 + facing2 / 2 / pixel2) * np.eye(2) + BY_SIZE**2 * size
+    return SmallSpot(patch, camera, patch.peak_px, size, noise, shape, flags=("off_peak",))
+
+
+def _facing(sightline: Array, light: Array, priors: Priors) -> float:
+    """Return the angle, rad, between the normal that faces a light and the one that bisects it and the camera."""
+    to_light = light - priors.distance.mean * sightline
+    cosine = -float(to_light @ sightline) / max(float(np.linalg.norm(to_light)), AT_CAMERA_MM)
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0))) / 2
 
 
 def isophote_of_each(

@@ -209,6 +209,8 @@ def add_common_parts(
 ) -> Estimate:
     """Add the parts ``camera`` and ``response``, where the priors leave them open, and ``shape`` by near misses.
 
+    The floors of a picture (`simtest.calibration.priors.Floors`) add to ``resolution`` and ``response``.
+
     An estimate without a budget stays without; so does one whose part ``camera`` cannot be computed.
     """
     if estimate.budget is None:
@@ -223,6 +225,12 @@ def add_common_parts(
         parts["camera"] = turned
     if priors.falloff_power is not None and family is not None:
         parts["response"] = falloff_part(estimate.normal, family, priors.falloff_power, priors)
+    if priors.open.feature_sd > 0:
+        parts["resolution"] = priors.open.feature_sd**2 * np.eye(2)
+    if priors.open.response_sd > 0 and family is not None:
+        turn = basis_across(estimate.normal) @ family.basis.T
+        moved = priors.open.response_sd**2 * turn @ family.seen_moments @ turn.T
+        parts["response"] = parts.get("response", 0.0) + moved
     return estimate.with_parts(**parts)
 
 

@@ -9,7 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Calibration, CameraPrior, Priors
-from simtest.calibration.priors import UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, UNTOLD_SLOPE_RAD
+from simtest.calibration.priors import (
+    OF_PICTURES,
+    UNTOLD_FALLOFF_POWER,
+    UNTOLD_OFFSET_MM,
+    UNTOLD_SLOPE_RAD,
+    Floors,
+)
 from simtest.detection.view import DARK, View
 from simtest.errors import InputError
 from simtest.estimators.prior_parts import relief_part
@@ -130,6 +136,7 @@ def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumpti
     `encoding` is the one that was told beside the calibration, if any. A default of `Priors` counts as told by nobody.
     """
     priors, key = calibration.priors, "in a calibration file"
+    floors, given = priors.open, priors.floors != OF_PICTURES
     made: list[Assumption] = []
 
     def add(what: str, distribution: str, how_to_narrow: str, given: bool = False) -> None:
@@ -141,10 +148,12 @@ def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumpti
     if priors.lights_covariance is not None:
         worst = float(np.sqrt(np.linalg.eigvalsh(priors.lights_covariance)[:, -1].max()))
         spread = f"as given, normal, ± {worst:.2g} mm along the least certain axis"
-        add("light positions", spread, f"[rig] lights_mm and lights_covariance_mm2 {key}", True)
+        how = f"[rig] lights_covariance_mm2 or [uncertainty] light_floor_mm and light_floor_deg {key}"
+        add("light positions", spread, how, bool(priors.lights_covariance_mm2) or given)
     if priors.distance.sd > 0:
-        how = f"[rig] distance_mm or distance_range_mm {key}"
-        add("distance of the tissue", f"{priors.distance} mm along the sightline", how, priors.distance_mm is not None)
+        how = f"[rig] distance_mm or distance_range_mm, or [uncertainty] distance_floor, {key}"
+        as_given = priors.distance == priors.distance_mm or (given and priors.distance_mm is not None)
+        add("distance of the tissue", f"{priors.distance} mm along the sightline", how, as_given)
     camera, prior = calibration.camera, priors.camera
     told = not prior.guessed
     if prior.focal_sd > 0:
@@ -160,6 +169,7 @@ def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumpti
         add("distortion", spread, f"[camera.distortion] and [uncertainty] distortion_sd {key}", told)
     if calibration.response is None and encoding is None:
         add("response", "sRGB, sharpened or not", f"[response] {key}, or --encoding")
+    made += _of_normals(floors, given)
     if priors.falloff_power is not None:
         falloff = f"cos^k over the angle from the optical axis, k {priors.falloff_power}"
         how = f"[vignetting] and [emission] {key}, or [uncertainty] falloff_power"
@@ -172,6 +182,17 @@ def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumpti
     if not priors.plane:
         made.append(NEAR_MISSES)
     return made
+
+
+def _of_normals(floors: Floors, given: bool) -> list[Assumption]:
+    """List the floors of each normal."""
+    moved, turned = f"± {floors.response_sd:.2g} of its size", f"± {math.degrees(floors.feature_sd):.2g} deg an axis"
+    each = (
+        ("response, for a highlight's centre", floors.response_sd, moved, "response_floor"),
+        ("features finer than a pixel, for the normal", floors.feature_sd, turned, "feature_floor_deg"),
+    )
+    how = "[uncertainty] {} in a calibration file"
+    return [Assumption(what, spread, how.format(key), given) for what, sd, spread, key in each if sd > 0]
 
 
 def light_note(assumed: Iterable[Assumption]) -> str:

@@ -24,6 +24,8 @@ FLAGS = {
     "missing_isovalues": "some isovalues gave no ellipse, or enclose other highlights too; they were left out",
     "near_degenerate": "the peak fits neither candidate of the circle pose: the two-fold model does not apply",
     "not_elliptic": "an isophote is no ellipse, as where two highlights touch or the curvature changes under one",
+    "off_peak": "the isophotes do not lead to the peak, as those of a body's shading: the normal is that at the peak, "
+    "and the distance is in its error",
     "partial_arc": "an isophote runs into a border, where the highlight may be cut; it was left out, or fitted in part",
     "round": "noise hides the principal directions",
     "saturated": "the isophotes enclose clipped pixels",

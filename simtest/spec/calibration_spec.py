@@ -21,9 +21,11 @@ from simtest.calibration import (
 from simtest.calibration.calibration import OPTICAL_AXIS
 from simtest.calibration.photometry import AngularProfile
 from simtest.calibration.priors import (
+    OF_PICTURES,
     UNTOLD_FALLOFF_POWER,
     UNTOLD_OFFSET_MM,
     UNTOLD_SLOPE_RAD,
+    Floors,
     Matrix,
     check_light_covariances,
 )
@@ -89,7 +91,7 @@ class RigCalibration(Spec):
         (),
         max_length=32,
         description="covariance of each light's position, a 3 x 3 matrix a light, mm^2, as `simtest calibrate light` "
-        "writes it; default: the positions are exact",
+        "writes it; default: as `uncertainty.light_floor_mm` has them",
     )
     distance_mm: Millimetres | None = Field(
         None, description="working distance along the sightline, mm: measured, or the middle of what is expected"
@@ -114,6 +116,17 @@ class RigCalibration(Spec):
         return self
 
 
+Floor = Annotated[float | None, Field(ge=0, le=100)]
+"""A least standard deviation; none below it is reported of a picture, whatever else is given."""
+
+FLOORS = {
+    "light_sd_mm": ("light_floor_mm", None), "light_sd": ("light_floor_deg", "deg"),
+    "distance_sd": ("distance_floor", None), "feature_sd": ("feature_floor_deg", "deg"),
+    "response_sd": ("response_floor", None), "off_peak": ("off_peak", None),
+}  # fmt: skip
+"""Key and unit of each number of `Floors`."""
+
+
 class UncertaintyCalibration(Spec):
     """How far what the other tables state may be off."""
 
@@ -135,6 +148,32 @@ class UncertaintyCalibration(Spec):
         "default none where vignetting and emission are both given (power = 0 where it is uniform) and an emission "
         "that is not uniform has no lights_mm beside the camera; else [0, 4]",
     )
+    light_floor_mm: Floor = Field(
+        None, description="of a light without lights_covariance_mm2, an axis, mm; default in pictures 0.2"
+    )
+    light_floor_deg: Floor = Field(None, description="the same as seen from the camera, deg; default in pictures 0.5")
+    distance_floor: Floor = Field(None, description="of a given distance, share of it; default in pictures 0.03")
+    feature_floor_deg: Floor = Field(
+        None, description="of the normal by features finer than a pixel, an axis, deg; default in pictures 0.4"
+    )
+    response_floor: Floor = Field(
+        None, description="of a highlight's centre by the response, share of its size; default in pictures 0.05"
+    )
+    off_peak: Floor = Field(
+        None,
+        description="an answer that looks farther off its peak than this share of its highlight's size is given at the "
+        "peak or refused; default in pictures 0.05, 0: none is",
+    )
+
+    @property
+    def floors(self) -> Floors | None:
+        """The floors, those that are not given as in pictures; None where none is."""
+        given = {
+            name: value if unit is None else math.radians(value)
+            for name, (key, unit) in FLOORS.items()
+            if (value := getattr(self, key)) is not None
+        }
+        return replace(OF_PICTURES, **given) if given else None
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
@@ -248,6 +287,7 @@ class CalibrationSpec(Spec):
             falloff_power=_distribution(told.falloff_power) or UNTOLD_FALLOFF_POWER,
             relief_slope=_distribution(slopes, math.radians(1.0)) or UNTOLD_SLOPE_RAD,
             lights_covariance_mm2=rig.lights_covariance_mm2,
+            floors=told.floors,
         )
 
 
@@ -344,10 +384,12 @@ def _surface(priors: Priors) -> dict[str, Any]:
 
 
 def _uncertainty(priors: Priors, states_falloff: bool) -> dict[str, Any]:
-    power = priors.falloff_power
+    power, floors = priors.falloff_power, priors.floors
+    values = {} if floors is None else {key: (getattr(floors, name), unit) for name, (key, unit) in FLOORS.items()}
     return {
         **{name: deviation or None for name, deviation in priors.camera.deviations.items()},
         "falloff_power": _interval(power) if states_falloff or power != UNTOLD_FALLOFF_POWER else None,
+        **{key: degrees_of(value) if unit else value for key, (value, unit) in values.items()},
     }
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import simtest
-from simtest.calibration import NO_PRIORS, CameraPrior, Priors, Uniform, exactly
+from simtest.calibration import NO_PRIORS, CameraPrior, Priors, Uniform, exactly, srgb_encode
+from simtest.calibration.priors import OF_PICTURES, Floors
 from simtest.detection import Region
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.process.messages import priors_message
@@ -328,3 +329,59 @@ def test_the_best_without_a_distance_errs_least_at_every_working_distance(surfac
     assert best == min(errors, key=errors.get)
     # And it says how far it may be off.
     assert errors[best] <= 2.5 * np.degrees(np.sqrt(np.trace(found.estimates[best].covariance)))
+
+
+# Floors of pictures ---------------------------------------------------------------------------------------------------
+
+
+def shaded(cut=0):
+    """A body whose broad shading has its maximum 12 px beside a small highlight; 8 bits, sRGB."""
+    x, y = np.meshgrid(np.arange(200), np.arange(160))
+    light = 0.7 * np.exp(-((x - 100) ** 2 + (y - 80) ** 2) / 1800) + 0.15 * np.exp(
+        -((x - 112) ** 2 + (y - 80) ** 2) / 50
+    )
+    return np.rint(255 * srgb_encode(light[cut:])).astype(np.uint8)
+
+
+def lit(height=160, floors=None):
+    priors = Priors(((40.0, 0.0, 0.0),), exactly(100.0), falloff_power=None, floors=floors)
+    return simtest.Calibration(simtest.Camera.from_fov(40.0, 200, height), priors=priors)
+
+
+def test_an_answer_off_its_peak_is_given_there_with_the_distance_in_its_budget():
+    roi = (20, 10, 170, 140)
+    before = simtest.reconstruct(shaded(), lit(floors=Floors()), ["bisector"], roi)[0].best_estimate
+    after = simtest.reconstruct(shaded(), lit(), ["bisector", "brightest_point"], roi)[0]
+    peak = after.patch.peak_px
+    assert np.hypot(*(before.look_px - peak)) > 3
+    assert "off_peak" in after.best_estimate.flags
+    assert np.hypot(*(after.best_estimate.look_px - peak)) < 1.5
+    assert after.best_estimate.deviation_deg > 3 * before.deviation_deg
+    assert "off_peak" in after.estimates["brightest_point"].flags
+
+
+def test_off_its_peak_and_cut_is_refused():
+    found = simtest.reconstruct(shaded(60), lit(100), ["bisector"], (20, 0, 170, 90))[0].estimates["bisector"]
+    assert isinstance(found, Failure)
+    assert found.reason == Reason.NO_ESTIMATE
+    assert "off the peak" in found.detail
+
+
+def test_pictures_have_floors_and_linear_frames_none():
+    picture = np.rint(255 * srgb_encode(spot())).astype(np.uint8)
+    of_picture, open_ = (simtest.reconstruct(picture, lit(floors=f), ["bisector"]) for f in (None, Floors()))
+    linear = simtest.reconstruct(spot(), lit(), ["bisector"])
+    parts = [each[0].best_estimate.budget for each in (of_picture, open_, linear)]
+    assert np.trace(parts[0]["resolution"]) >= 2 * OF_PICTURES.feature_sd**2
+    assert "light_offset" in parts[0]
+    assert "response" in parts[0]
+    assert all(not {"light_offset", "response"} & set(part) for part in parts[1:])
+    named = {each.what: each for each in of_picture.choices.assumed}
+    floors = {
+        "light positions",
+        "distance of the tissue",
+        *(what for what in named if what.startswith(("response,", "features"))),
+    }
+    assert len(floors) == 4
+    assert not any(named[what].given for what in floors)
+    assert not floors & {each.what for spots in (open_, linear) for each in spots.choices.assumed}

@@ -1,12 +1,14 @@
 """Lights whose positions are told with a covariance: files, messages to cores, and the budget's part light_offset."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import simtest
-from simtest.calibration import Priors, exactly
+from simtest.calibration import Normal, Priors, exactly
+from simtest.calibration.priors import OF_PICTURES, Floors
 from simtest.estimators.prior_parts import mean_light_part, told_light_part
 from simtest.estimators.process.messages import priors_message
 from simtest.geometry import Array
@@ -51,11 +53,37 @@ def test_file_reads_back(tmp_path: Path) -> None:
     assert load_calibration(path).priors == priors
 
 
+def test_a_light_without_a_covariance_has_that_of_the_floors() -> None:
+    far = Priors(lights_mm=((300.0, 0.0, 0.0),), floors=Floors(light_sd_mm=3.0, light_sd=0.04 / 3))
+    assert far.lights_covariance is not None
+    np.testing.assert_allclose(far.lights_covariance, 25.0 * np.eye(3)[None])
+    assert priors_message(far)["lights_covariance_mm2"] == far.lights_covariance.tolist()
+    given = replace(far, lights_covariance_mm2=(COVARIANCE,))
+    np.testing.assert_array_equal(given.lights_covariance, [COVARIANCE])
+    exact = replace(far, lights_covariance_mm2=(((0.0, 0.0, 0.0),) * 3,))
+    assert exact.lights_covariance is None
+
+
+def test_a_distance_is_no_surer_than_its_floor() -> None:
+    floors = Floors(distance_sd=0.03)
+    assert Priors(distance_mm=exactly(50.0), floors=floors).distance == Normal(50.0, 1.5)
+    assert Priors(distance_mm=Normal(50.0, 2.0), floors=floors).distance == Normal(50.0, 2.0)
+
+
+def test_floors_of_a_file_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "scope.toml"
+    path.write_text(f"{CAMERA}lights_mm = [[1, 0, 0]]\n[uncertainty]\nfeature_floor_deg = 0.0\noff_peak = 0.2\n")
+    priors = load_calibration(path).priors
+    assert priors.floors == replace(OF_PICTURES, feature_sd=0.0, off_peak=0.2)
+    save_calibration(load_calibration(path), path)
+    assert load_calibration(path).priors == priors
+
+
 def test_cores_are_told_only_what_is_stated() -> None:
     exact = Priors(lights_mm=((4.0, 0.0, 0.0),))
     assert "lights_covariance_mm2" not in priors_message(exact)
     told = Priors(lights_mm=((4.0, 0.0, 0.0),), lights_covariance_mm2=(COVARIANCE,))
-    assert priors_message(told)["lights_covariance_mm2"] == (COVARIANCE,)
+    assert priors_message(told)["lights_covariance_mm2"] == [[list(row) for row in COVARIANCE]]
 
 
 MALFORMED = {

@@ -348,7 +348,7 @@ def priors_message(priors: Priors) -> dict[str, Any]:
         "camera": priors.camera.deviations,
         "plane": priors.plane,
         # A core that was written before this key existed gets the messages that it knows.
-        **({"lights_covariance_mm2": priors.lights_covariance_mm2} if priors.lights_covariance_mm2 else {}),
+        **({} if (spread := priors.lights_covariance) is None else {"lights_covariance_mm2": spread.tolist()}),
     }
 
 
