@@ -2,8 +2,9 @@
 
 `python -m benchmarks growth` prints the table of docs/measured/performance.md. Each piece of work is done at five sizes
 or more, which span a factor of 16 or more. The sizes take turns, so that a slow spell of the machine hits all of them
-alike. The exponent is the slope of log time over log size. A piece that has a fixed cost grows slowly at small sizes and only then
-as it must, so the exponent over the upper half of the sizes is given too, and the larger of both must keep the limit.
+alike. The exponent is the slope of log time over log size. A piece that has a fixed cost grows slowly at small sizes
+and only then as it must, so the exponent over the upper half of the sizes is given too, and the larger of both must
+keep the limit.
 """
 
 import math
