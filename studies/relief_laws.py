@@ -1,7 +1,7 @@
 """Measure the laws of glints on relief: python -m studies.relief_laws [PART]... [--scale S].
 
 Parts, default all: `normals` (the glints' normals against the base's, theory.md 7.4), `numbers` (7.2), `clouds` (7.1),
-`centroids` (7.5), `sizes` (7.3), `shown` (7.4 of isolated and visible highlights), `search` (the search for glints
+`sizes` (7.3), `shown` (7.4 of isolated and visible highlights), `search` (the search for glints
 against an exhaustive one). S scales the number of glints that are wanted; 1 is that of the tables. Every frame has a
 relief of its own.
 """
@@ -227,41 +227,6 @@ def print_clouds(scale: float) -> None:
         )
 
 
-# Centroids -------------------------------------------------------------------------------------------------------
-
-
-def centroid_errors(case: Case, wanted: int) -> tuple[Array, Array]:
-    """Return the errors of the glints' mean sightline against the base's normal, rad, and the glints of each frame."""
-    errors: list[float] = []
-    numbers: list[int] = []
-    for session in frames(case):
-        pixels = highlights.find_zeros(session, True)[0]
-        if len(pixels):
-            mean = session.camera.unproject(pixels).mean(axis=0)
-            # The base faces the camera, which lies on the surface's axis.
-            errors.append(float(np.arctan2(np.hypot(mean[0], mean[1]), mean[2])))
-            numbers.append(len(pixels))
-        if len(errors) == wanted:
-            return np.array(errors), np.array(numbers)
-    raise AssertionError("unreachable")
-
-
-def print_centroids(scale: float) -> None:
-    """Print the table of centroids."""
-    print("centroids: error of the mean sightline (theory.md 7.5); 4 deg, wavelength 2 mm, 20 mm")
-    print("surface     frames  glints   error, deg   in units of s/sqrt(N), slope over the gains")
-    for surface in CURVED:
-        case = Case(surface, 4.0, 2.0)
-        errors, numbers = centroid_errors(case, int(60 * scale))
-        units = laws.independent_centroid_error(case.slope, numbers, case.gains) / laws.relief_error(1.0)
-        share = errors / units
-        print(
-            f"{surface:10s} {len(errors):6d}  {numbers.mean():6.1f}   {np.degrees(errors.mean()):8.2f}     "
-            f"{share.mean():.2f} +- {share.std(ddof=1) / np.sqrt(len(share)):.2f}",
-            flush=True,
-        )
-
-
 # Sizes -----------------------------------------------------------------------------------------------------------
 
 
@@ -388,7 +353,7 @@ def print_search(scale: float) -> None:
 
 PARTS = {
     "normals": print_normals, "numbers": print_numbers, "clouds": print_clouds, "sizes": print_sizes,
-    "centroids": print_centroids, "shown": print_shown, "search": print_search,
+    "shown": print_shown, "search": print_search,
 }  # fmt: skip
 
 

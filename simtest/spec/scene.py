@@ -205,6 +205,7 @@ class Scene(Spec):
             None if mean is None else Normal(mean, mean * self.known.distance_sd),
             None if curvature is None else exactly(curvature),
             falloff_power=None if told else UNTOLD_FALLOFF_POWER,
+            floors=NO_FLOORS,
         )
 
 

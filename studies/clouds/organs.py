@@ -7,23 +7,36 @@ clouds of these frames, before any is refused.
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
 
-from simtest.calibration import Frame
-from simtest.errors import Failure
+from simtest.calibration import Calibration, Frame
+from simtest.errors import Failure, SimtestError
 from simtest.estimators.budget import total
 from simtest.estimators.cloud import LEAST_VERIFIABLE, SLOPES, TYPICAL_SLOPE, Groups, cloud
 from simtest.estimators.cloud_light import DiffuseLight, find_spots
 from simtest.estimators.cloud_mixture import CLUMPING, sampling_covariance
 from simtest.geometry.vectors import basis_across
-from simtest.runtime.arrays import Array
-from studies.clouds.organ_frames import ORGANS, SLOPES_DEG, BaseFrame, frames
-from studies.kept import of_this_code
+from simtest.rendering import Session
+from simtest.runtime.arrays import Array, Image
+from simtest.simulation.frame import render_picture
+from simtest.spec import Scene, load_scene, scene_from_dict
+from studies.kept import of_this_code, write_arrays
+
+ORGANS = ("colon", "liver", "gallbladder")
+SLOPES_DEG = (3.0, 6.0, 10.0, 17.0)
+HEIGHTS_MM = {"colon": 0.226, "liver": 0.226, "gallbladder": 0.138}
+"""Of the shipped relief."""
+
+HIGHEST_MM = 0.27
+"""Steeper relief is drawn finer, so that it stays below this."""
+
+STRIDE = 4
+"""Of the pixels whose base normal is kept, px."""
 
 SMOOTHING_PX = 1.0
 REGION = 3.0
@@ -31,6 +44,79 @@ REGION = 3.0
 
 SURE, SURE_DEG = 3.0, 5.0
 """Wrong and sure: so many times the stated error, and by so much."""
+
+
+@dataclass(frozen=True)
+class BaseFrame:
+    """A rendered picture with its base's normals at every `STRIDE`-th pixel, zero or NaN off the surface."""
+
+    organ: str
+    slope_deg: float
+    picture: Image
+    normals: Array
+    calibration: Calibration
+
+    def normal_at(self, pixel: Array) -> Array | None:
+        """Return the base's normal at a pixel, none off the surface."""
+        column, row = (int(v // STRIDE) for v in pixel)
+        if not (0 <= row < self.normals.shape[0] and 0 <= column < self.normals.shape[1]):
+            return None
+        normal = self.normals[row, column]
+        return np.asarray(normal, dtype=float) if np.abs(normal).sum() > 0.5 else None
+
+
+def organ_scene(organ: str, slope_deg: float, seed: int) -> Scene:
+    """Return a shipped tissue scene at a viewpoint drawn for it, its relief scaled to a slope along one direction."""
+    place: dict[str, object] = {"surface.viewpoint": seed}
+    if organ == "gallbladder":
+        rng = np.random.default_rng([seed, 3])
+        place = {"surface.tilt_deg": float(rng.uniform(0, 25)), "surface.spin_deg": float(rng.uniform(0, 180))}
+    drawn = {"surface.relief.seed": seed, "sensor.seed": seed, "render.samples_per_pixel": 4, **place}
+    data = load_scene(f"tissue_{organ}", drawn).model_dump(mode="json")
+    bands = data["surface"]["relief"]["bands"]
+    scale = slope_deg / float(np.sqrt(sum(band["slope_deg"] ** 2 for band in bands)))
+    finer = min(1.0, HIGHEST_MM / (HEIGHTS_MM[organ] * scale))
+    for band in bands:
+        band["slope_deg"] *= scale
+        band["wavelength_mm"] *= finer
+    return scene_from_dict(data)
+
+
+def frames(first: int, many: int, folder: Path) -> Iterator[BaseFrame]:
+    """Yield `many` frames of each organ and slope, seeds from `first` on, from a folder or rendered into it.
+
+    What cannot be rendered is said.
+    """
+    for o, organ in enumerate(ORGANS):
+        session = None
+        for n in range(many * len(SLOPES_DEG)):
+            seed, slope = first + 1000 * o + n, SLOPES_DEG[n % len(SLOPES_DEG)]
+            scene, file = organ_scene(organ, slope, seed), folder / f"{organ}_{slope:g}_{seed}.npz"
+            try:
+                if not file.exists():
+                    session = session or Session(scene)
+                    write_arrays(file, _rendered(session, scene))
+            except SimtestError as error:
+                print(f"{organ}, {slope:g} deg, seed {seed}: {error}")
+                continue
+            with np.load(file) as kept:
+                picture, normals, nearest = (kept[name] for name in ("picture", "normals", "nearest_mm"))
+            yield BaseFrame(
+                organ, slope, picture, normals, scene.calibration(float(nearest[0]) if len(nearest) else None)
+            )
+
+
+def _rendered(session: Session, scene: Scene) -> dict[str, Array]:
+    """Return picture, base normals, and the distance of the base's nearest lit highlight point, if there is one."""
+    session.update(scene)
+    radiance = session.radiance()
+    distances = [point.distance for point in session.base_highlights(radiance) if point.lit]
+    normals = np.asarray(session.truth(STRIDE).normal_base)
+    return {
+        "picture": np.asarray(render_picture(session, scene, radiance), dtype=np.float32),
+        "normals": normals.astype(np.float32),
+        "nearest_mm": np.array(sorted(distances)[:1]),
+    }
 
 
 @dataclass(frozen=True)
@@ -152,10 +238,10 @@ def main() -> None:
     asked = parser.parse_args()
     drawn = frames(asked.first, asked.many, asked.frames or of_this_code(Path("reports/studies/organs")))
     if asked.fit:
-        rows = [row for *_, frame in drawn for row in found_in(frame)]
+        rows = [row for frame in drawn for row in found_in(frame)]
         print(f"{len(rows)} clouds:", ", ".join(f"{name} {value:.2f}" for name, value in fitted(rows).items()))
         return
-    done = [Read(organ, slope, told, read(frame, told)) for organ, slope, _, frame in drawn for told in (True, False)]
+    done = [Read(frame.organ, frame.slope_deg, told, read(frame, told)) for frame in drawn for told in (True, False)]
     print("| frames | n | answered | answers | median, deg | 95th percentile | mean radius | inside | wrong and sure |")
     print("|---|---|---|---|---|---|---|---|---|")
     for told, light in ((True, "light given"), (False, "not given")):

@@ -1,6 +1,6 @@
 """Print the tables of docs/measured/gate.md: `python -m studies.gate [SECTION]...`, all sections by default.
 
-`python -m studies.gate figures` prints the figures beside their limits. The bank of 20,400 realisations takes 10
+The bank of 20,400 realisations takes 10
 minutes of processor time and is kept in the folder that GATE_BANK names (default: gate-bank in the system's folder for
 temporary files).
 """
@@ -8,7 +8,6 @@ temporary files).
 import sys
 from collections.abc import Callable
 
-from benchmarks.measuring import print_figures
 from studies.gate import proof
 from studies.gate.bank import frames_of, load_bank
 
@@ -38,7 +37,7 @@ def harmless() -> str:
 def rises() -> str:
     """Return the table of a rise of one estimator's errors."""
     found = proof.rises(load_bank(proof.bank_folder()))
-    rows = [(paired.name, _percent(paired), _percent(fresh), paired.about) for paired, fresh, _ in found]
+    rows = [(paired.name, _percent(paired), _percent(fresh), paired.about) for paired, fresh in found]
     return _table(("estimator", "seen, same seeds", "seen, fresh seeds", "10 % is beyond the margin in"), rows)
 
 
@@ -52,23 +51,13 @@ def faults() -> str:
     return _table(("planted fault", "laws that do not hold", "gate, same seeds", "gate, fresh seeds"), rows)
 
 
-def noise() -> str:
-    """Return the table of the laws of noise."""
-    sound, reused = proof.noise_laws()
-    return _table(
-        ("laws of noise", "do not hold"), [("code as it is", _percent(sound)), (reused.name, _percent(reused))]
-    )
-
-
 SECTIONS: dict[str, Callable[[], str]] = {
-    "alarms": alarms, "harmless": harmless, "rises": rises, "faults": faults, "noise": noise,
+    "alarms": alarms, "harmless": harmless, "rises": rises, "faults": faults,
 }  # fmt: skip
 
 
 def main(names: list[str]) -> int:
     """Print some sections, all by default."""
-    if names == ["figures"]:
-        return print_figures(proof.figures())
     if unknown := next((name for name in names if name not in SECTIONS), None):
         print(f"section {unknown!r}: unknown; must be one of {', '.join(SECTIONS)}", file=sys.stderr)
         return 2

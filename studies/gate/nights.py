@@ -119,12 +119,11 @@ class Paired:
 class Found:
     """The gate's verdict on one night.
 
-    `alarm`: whether anything was worse, or must be explained; `estimators`: of which; `tests`: size of the family;
-    `least`: least corrected p-value; 1 without a test.
+    `alarm`: whether anything was worse, or must be explained; `tests`: size of the family; `least`: least corrected
+    p-value; 1 without a test.
     """
 
     alarm: bool
-    estimators: tuple[str, ...]
     tests: int
     least: float
 
@@ -134,10 +133,8 @@ def judge(draw: Draw, seed: int) -> Found:
     tonight, baseline = draw(np.random.default_rng(seed))
     verdict = compare(tonight, baseline)
     tested = verdict.comparisons.filter(pl.col("p").is_not_null())
-    findings = pl.concat([verdict.regressions, verdict.unexplained])
-    blamed = findings["estimator"].unique().sort().to_list()
     least = tested["p_holm"].to_numpy().min() if tested.height else 1.0
-    return Found(verdict.exit_code != 0, tuple(blamed), tested.height, float(least))
+    return Found(verdict.exit_code != 0, tested.height, float(least))
 
 
 _draw: Draw

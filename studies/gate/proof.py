@@ -8,31 +8,26 @@ from pathlib import Path
 
 import polars as pl
 
-from benchmarks.measuring import Figure
 from simtest.errors import SimtestError
 from simtest.nightly.contrasts import margin_of
 from simtest.nightly.quantities import QUANTITIES
 from simtest.runtime.processes import make_engine
 from simtest.spec import Experiment
 from simtest.validation.runner import run_experiment
-from studies.gate.bank import COLUMNS, experiment, frames_of, load_bank
+from studies.gate.bank import COLUMNS, experiment
 from studies.gate.faults import FAULTS, HARMLESS, Mutation, planted
 from studies.gate.nights import Draw, Found, Fresh, Paired, Source, equal_cells, judge_many, raised
 from tests.laws.all_laws import measures
 from tests.laws.law import Law
-from tests.laws.randomness import noises
 
 FRESH_NIGHTS = int(os.environ.get("GATE_NIGHTS") or 1000)
 """Nights of fresh seeds of each kind; GATE_NIGHTS changes it."""
 
-PAIRED_NIGHTS, DETECTION_NIGHTS, LAW_SEEDS = 200, 100, 100
+PAIRED_NIGHTS, DETECTION_NIGHTS = 200, 100
 N = 10
 """Realisations of each setting in a night."""
 
 RISE = 0.10
-MOST_ALARMS, LEAST_DETECTION = 0.01, 0.95
-CLEAR_MARGINS = 2.0
-"""A rise that is nowhere as many margins is hardly one, and has no detection to reach."""
 
 HARMLESS_CONTENT = {"paper": 10, "curvature": 4, "light_offset": 4, "compare": 4, "anatomy": 2}
 """Realisations of each setting that are made again with harmless changes; of a night's: `HARMLESS_N`."""
@@ -73,11 +68,6 @@ class Caught:
     paired: Rate
     fresh: Rate
     stops: bool
-
-    @property
-    def share(self) -> float:
-        """Share of nights in which the fault is seen: laws see it always."""
-        return 1.0 if self.laws else self.paired.share
 
 
 def bank_folder() -> Path:
@@ -140,8 +130,8 @@ def _made(experiments: list[Experiment], mutations: tuple[Mutation, ...] = (), w
     return pl.concat([table.select(*COLUMNS) for table in tables])
 
 
-def rises(bank: pl.DataFrame, nights: int = DETECTION_NIGHTS) -> list[tuple[Rate, Rate, bool]]:
-    """Judge nights in which one estimator's errors are 10 % larger: paired, of fresh seeds, and whether clearly."""
+def rises(bank: pl.DataFrame, nights: int = DETECTION_NIGHTS) -> list[tuple[Rate, Rate]]:
+    """Judge nights in which one estimator's errors are 10 % larger: paired, and of fresh seeds."""
     source = Source.of(bank)
     made = []
     for estimator in sorted(bank["estimator"].unique()):
@@ -154,7 +144,6 @@ def rises(bank: pl.DataFrame, nights: int = DETECTION_NIGHTS) -> list[tuple[Rate
             (
                 _rate(estimator, Paired(source, after, N), nights, about=about),
                 _rate(estimator, Fresh(source, N, after), nights),
-                bool(margins.max() >= CLEAR_MARGINS),
             )
         )
     return made
@@ -216,43 +205,3 @@ def _broken(name: str, measure: Callable[[], list[Law]]) -> list[str]:
 
 def _draws(before: Source, after: Source, equal: pl.DataFrame | None) -> tuple[Draw, Draw]:
     return Paired(before, after, N, equal), Fresh(before, N, after)
-
-
-def noise_laws(seeds: int = LAW_SEEDS) -> tuple[Rate, Rate]:
-    """Ask the laws of noise, with many seeds: of the code as it is, and with the noise seed reused."""
-    rates = []
-    for name in ("none", "noise seed reused"):
-        with planted(*FAULTS.get(name, ())):
-            failed = [any(not law.holds for law in noises(seed=seed)) for seed in range(seeds)]
-        rates.append(Rate(name, seeds, sum(failed)))
-    return rates[0], rates[1]
-
-
-def figures() -> list[Figure]:
-    """Return all figures beside their limits."""
-    bank = load_bank(bank_folder())
-    made = [Figure("realisations in the bank", frames_of(bank), 20_000, True, "")]
-    made += [_alarm(f"false alarms, {rate.name}", rate) for rate in (*false_alarms(bank), *harmless())]
-    for paired, fresh, clear in rises(bank):
-        name = f"errors of {paired.name} up by {RISE:.0%}"
-        made.append(_detection(f"{name}, same seeds", paired, LEAST_DETECTION if clear else None))
-        made.append(Figure(f"{name}, fresh seeds", fresh.share, unit="", about=fresh.about))
-    for caught in faults():
-        about = ", ".join(caught.laws) or caught.paired.about
-        if caught.name == "none":
-            made.append(Figure("code as it is: laws that do not hold", len(caught.laws), 0, unit="", about=about))
-            made.append(_alarm("code as it is, gate, fresh seeds", caught.fresh))
-        else:
-            made.append(Figure(caught.name, caught.share, LEAST_DETECTION, True, "", about))
-    sound, reused = noise_laws()
-    made.append(_alarm("laws of noise, code as it is", sound))
-    made.append(_detection("laws of noise, seed reused", reused))
-    return made
-
-
-def _alarm(name: str, rate: Rate) -> Figure:
-    return Figure(name, rate.share, MOST_ALARMS, unit="", about=f"{rate.alarms} of {rate.nights}; {rate.about}")
-
-
-def _detection(name: str, rate: Rate, least: float | None = LEAST_DETECTION) -> Figure:
-    return Figure(name, rate.share, least, True, "", f"{rate.alarms} of {rate.nights}; {rate.about}")

@@ -27,6 +27,7 @@ from simtest.bench.run import (
 )
 from simtest.bench.scores import CERTIFICATE
 from simtest.bench.suite import (
+    HASHES,
     SUITE,
     CaseSpec,
     Draw,
@@ -58,7 +59,7 @@ from simtest.runtime.provenance import file_hash, version
 from simtest.spec import scene_from_dict
 from simtest.surfaces.factory import make_surface
 from simtest.validation.cases import expand
-from studies.bench_cases import unfrozen_keys
+from studies.bench_cases import freeze, unfrozen_keys
 from tests.bench_tiny import copied, tiny_suite
 from tests.refusals import refused
 
@@ -78,6 +79,16 @@ def frozen_copy(tmp_path: Path) -> Path:
 
 def test_the_suite_is_pinned(frozen: Suite) -> None:
     assert frozen.digest == V1
+
+
+def test_the_same_cases_are_frozen_with_the_same_hashes(frozen_copy: Path) -> None:
+    refused(lambda: freeze(frozen_copy), "is frozen; a changed case must be a new version")
+    hashes, plane = frozen_copy / HASHES, frozen_copy / "smooth" / "plane.toml"
+    before = hashes.read_bytes(), plane.read_bytes()
+    hashes.unlink()
+    plane.write_text(plane.read_text().replace("skew = 0.0\n", ""))
+    freeze(frozen_copy)
+    assert (hashes.read_bytes(), plane.read_bytes()) == before
 
 
 def test_every_default_is_frozen(frozen: Suite) -> None:

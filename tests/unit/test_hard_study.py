@@ -10,7 +10,7 @@ from simtest.errors import Failure, Reason
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Patch
 from simtest.geometry.vectors import deviation_deg
-from studies.hard.cases import Case, calibration_of, load, rows_in, save, scene_of
+from studies.hard.cases import Case, calibration_of, scene_of
 from studies.hard.measure import record, semi_axis_deg
 from studies.hard.rows import GROUPS, ROWS
 from studies.hard.scenes import KINDS, SPLITS, base_scene
@@ -50,21 +50,6 @@ def test_a_reported_deviation_is_the_rms_of_the_angle_and_a_semi_axis_that_along
     ahead = np.array([[0.0, 0.0, -1.0]])
     estimate = Estimate(ahead[0], ahead, np.zeros(2), covariance=covariance)
     assert estimate.deviation_deg == deviation_deg(covariance)
-
-
-def test_cases_are_read_as_they_were_written(tmp_path):
-    cases = [a_case(), a_case(normal=None, normal_base=None, holds=0, radius_px=float("nan"), row="vessels")]
-    save(tmp_path / "kept.npz", cases, ["vessels", "JPEG 80", "mosaic"])
-    assert rows_in(tmp_path / "kept.npz") == {"vessels", "JPEG 80", "mosaic"}
-    assert rows_in(tmp_path / "other.npz") == set()
-    for read, written in zip(load(tmp_path / "kept.npz"), cases, strict=True):
-        for name in ("row", "holds", "span_mm"):
-            assert getattr(read, name) == getattr(written, name)
-        np.testing.assert_array_equal(read.radius_px, written.radius_px)
-        assert (read.normal is None) == (written.normal is None)
-        for name in ("values", "raw", "saturated", "peak_px", "noise"):
-            np.testing.assert_array_equal(getattr(read.patch, name), getattr(written.patch, name))
-        assert read.patch.peak_pixel == written.patch.peak_pixel
 
 
 def test_the_interval_of_a_share_counts_scenes():
