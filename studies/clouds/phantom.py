@@ -69,14 +69,33 @@ def rows(name: str, spots: Specularities, normals: Array, origin: Array, scale: 
     return made or [f"| {name} | {spots.of_organ} | | | |"]
 
 
+def of_singles(spots: Specularities, normals: Array) -> str:
+    """Return how far single highlights are off the organ's normal, and how many of their regions contain it."""
+    errors, radii = [], []
+    for spot in spots:
+        best = spot.organ.get(spot.best) if spot.best else None
+        if best is not None and best.cloud is None and best.deviation_deg is not None:
+            x, y = (int(v) for v in best.look_px)
+            errors.append(float(angle_deg(best.normal, normals[y, x])))
+            radii.append(RADIUS * best.deviation_deg)
+    off = np.array(errors)
+    known, inside = np.isfinite(off), off <= np.array(radii)
+    return (
+        f"{known.sum()} single highlights: median {np.median(off[known]):.1f} deg off the organ's normal, "
+        f"{100 * inside[known].mean():.0f} % inside its 95 % region of {np.median(radii):.0f} deg"
+    )
+
+
 def main() -> None:
-    """Print the clouds' answers."""
+    """Print the clouds' answers, and those of the single highlights of the frame as it is."""
     parser = argparse.ArgumentParser(prog="python -m studies.clouds.phantom", description=__doc__)
     parser.add_argument("folder", type=Path)
-    print("| frame | looks at, px | error, deg | radius | flags |\n|---|---|---|---|---|")
+    table, singles = ["| frame | looks at, px | error, deg | radius | flags |", "|---|---|---|---|---|"], ""
     for name, picture, normals, calibration, origin, scale in variants(parser.parse_args().folder):
         spots = simtest.reconstruct(np.ascontiguousarray(picture[..., ::-1]), calibration)
-        print("\n".join(rows(name, spots, normals, origin, scale)))
+        table += rows(name, spots, normals, origin, scale)
+        singles = singles or of_singles(spots, normals)
+    print("\n".join(table), singles, sep="\n\n")
 
 
 if __name__ == "__main__":
