@@ -168,7 +168,7 @@ CELL_PX = (1.5, 20.0)  # pixels of a cell along x: resampling covers these
 LEAST_HIGHLIGHTS, REFLECTION_LIMIT = 4, 2.0
 """From so many highlights a frame's normals are checked against the law of reflection, and refused beyond the limit.
 
-`python -m studies.learned_dense DATA MODEL --split validation` prints how far the validation split's frames go.
+`python -m studies.learned DATA --dense MODEL --split validation` prints how far the validation split's frames go.
 """
 
 HIGHLIGHT_LIMIT = 9.21
