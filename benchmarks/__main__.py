@@ -5,7 +5,7 @@ import sys
 
 from benchmarks.measuring import Figure, print_figures
 
-NAMES = ("rendering", "colour", "dataset")
+NAMES = ("rendering", "dataset")
 """Modules of this package with a function `figures()`."""
 
 ON_REQUEST = ("transfers", "growth", "cost")

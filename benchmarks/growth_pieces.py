@@ -8,16 +8,17 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 
-from benchmarks.colour import by_colour, spotted
 from benchmarks.transfers import smooth_scene
-from simtest.calibration import Calibration
+from simtest.calibration import Calibration, srgb_encode
 from simtest.geometry import Camera
-from simtest.reconstruction import detect_in_picture
+from simtest.reconstruction import detect_in_picture, reconstruct
 from simtest.reconstruction.options import default_estimators
 from simtest.rendering import Session, backend
 from simtest.report import write_report
+from simtest.runtime.arrays import Image
 from simtest.runtime.resources import find
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.frame import render_picture
@@ -32,6 +33,9 @@ from simtest.validation.statistics import summarise
 Works = dict[float, Callable[[], object]]
 
 EDGES_MM = (2.4, 1.7, 1.2, 0.85, 0.6, 0.42)
+WIDTH, HEIGHT = 1280, 720
+"""Of the pictures with more and more highlights."""
+
 WIDTHS = (160, 240, 320, 480, 640, 960, 1280)
 REALISATIONS = 20
 SPOTS = (4, 8, 16, 32, 64, 128)
@@ -162,17 +166,40 @@ def _views(work: Callable[[Session], Callable[[], object]]) -> Callable[[], Abst
 # Highlights ---------------------------------------------------------------------------------------------------------
 
 
+def _spotted(highlights: int) -> Image:
+    """Return shaded, mottled tissue in a round view, 8 bits, with highlights of 2 to 4 px spread evenly over it."""
+    columns = int(np.ceil(np.sqrt(highlights * 1.6)))
+    across, down = 860 / columns, 540 / -(-highlights // columns)
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    shading = 0.35 + 0.2 * np.sin(x / 170) * np.cos(y / 130)
+    linear = shading[..., None] * np.array([0.55, 0.28, 0.22])
+    for i in range(highlights):
+        column = 210 + across * (i % columns + 0.5) + rng.uniform(-0.1 * across, 0.1 * across)
+        row = 90 + down * (i // columns + 0.5) + rng.uniform(-0.1 * down, 0.1 * down)
+        wide, high = rng.uniform(2, 4, 2)
+        spot = np.exp(-0.5 * (((x - column) / wide) ** 2 + ((y - row) / max(high, wide / 2)) ** 2))
+        linear += rng.uniform(0.4, 1.2) * spot[..., None]
+    linear += rng.normal(0, 0.004, linear.shape)
+    linear[np.hypot(x - WIDTH / 2, y - HEIGHT / 2) > 560] = 0.002
+    return (np.rint(255 * srgb_encode(np.clip(linear, 0, 1))) / 255).astype(np.float32)
+
+
 def _pictures(normals: bool) -> Callable[[], AbstractContextManager[Works]]:
     @contextmanager
     def opened() -> Iterator[Works]:
         works: Works = {}
-        calibration = Calibration(Camera.from_fov(70.0, 1280, 720))
+        calibration = Calibration(Camera.from_fov(70.0, WIDTH, HEIGHT))
         names = default_estimators(calibration)
+
+        def normals_of(picture: Image) -> object:
+            return reconstruct(picture, calibration, names, detector="colour", encoding="srgb")
+
         for spots in SPOTS:
-            picture = spotted(spots)
+            picture = _spotted(spots)
             found = len(detect_in_picture(picture).detection.highlights)
             if normals:
-                works[float(found)] = lambda p=picture: by_colour(p, calibration, names)  # type: ignore[misc]
+                works[float(found)] = lambda p=picture: normals_of(p)  # type: ignore[misc]
             else:
                 works[float(found)] = lambda p=picture: detect_in_picture(p)  # type: ignore[misc]
         yield works
