@@ -111,7 +111,8 @@ def frames(body: str, count: int, seed: int) -> Iterator[tuple[Session, Image, C
             light = session.radiance().total
             shown = picture(light if made.is_coloured else light[..., 0], from_integer(1000 * seed + number + 500))
             middle = float(getattr(made.surface, "distance_mm", 0.0) or np.nanmedian(session.depths()))
-            priors = Priors((made.rig.lights[0].nominal_mm,), Normal(middle, 0.1 * middle), falloff_power=None)
+            lights, distance = (made.rig.lights[0].nominal_mm,), Normal(middle, 0.1 * middle)
+            priors = Priors(lights, distance, falloff_power=None, floors=OF_PICTURES)
             yield session, shown, Calibration(made.camera.model(), priors=priors)
 
 
