@@ -28,6 +28,7 @@ import numpy as np
 from benchmarks.measuring import print_markdown
 from simtest.advice.twin.scoring import ScoredSpot, score
 from simtest.calibration import Calibration, Normal, Priors, Uniform, exactly
+from simtest.calibration.priors import NO_FLOORS
 from simtest.dataset.plan import Drawn, Plan
 from simtest.errors import Failure, SimtestError
 from simtest.estimators import Estimate, prior_parts
@@ -126,7 +127,7 @@ def told(view: RenderedView, family: int) -> Calibration:
     camera, lights = view.calibration.camera, view.calibration.priors.lights_mm
     plain = Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     scope = next(name for name, families in SCOPES.items() if family in families)
-    return Calibration(plain, priors=Priors(lights_mm=lights, distance_mm=RANGES_MM[scope]))
+    return Calibration(plain, priors=Priors(lights_mm=lights, distance_mm=RANGES_MM[scope], floors=NO_FLOORS))
 
 
 def main(arguments: Sequence[str]) -> int:

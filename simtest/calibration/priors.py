@@ -269,7 +269,7 @@ OF_PICTURES = Floors(
     fitted_number("floors.response"),
     fitted_number("off_peak.share"),
 )
-"""The floors of photographs."""
+"""The floors of pictures that give none."""
 
 
 @dataclass(frozen=True)
@@ -300,7 +300,7 @@ class Priors:
         Covariance of each light's position, three rows of three numbers a light, mm^2; empty: not given, so that the
         floor holds, or else the positions are exact.
     floors : Floors, optional
-        What stays open whatever else is given, as `OF_PICTURES` of photographs; None: nothing.
+        What stays open whatever else is given; None: not given, which is `OF_PICTURES` in pictures, and nothing else.
 
     Raises
     ------

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from simtest.calibration import Calibration, CameraPrior, Priors
 from simtest.calibration.priors import (
     OF_PICTURES,
+    UNTOLD_DISTANCE_MM,
     UNTOLD_FALLOFF_POWER,
     UNTOLD_OFFSET_MM,
     UNTOLD_SLOPE_RAD,
@@ -148,12 +149,14 @@ def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumpti
     if priors.lights_covariance is not None:
         worst = float(np.sqrt(np.linalg.eigvalsh(priors.lights_covariance)[:, -1].max()))
         spread = f"as given, normal, ± {worst:.2g} mm along the least certain axis"
-        how = f"[rig] lights_covariance_mm2 or [uncertainty] light_floor_mm and light_floor_deg {key}"
-        add("light positions", spread, how, bool(priors.lights_covariance_mm2) or given)
+        stated = bool(priors.lights_covariance_mm2)
+        how = "[rig] lights_covariance_mm2" + " or [uncertainty] light_floor_mm and light_floor_deg" * (not stated)
+        add("light positions", spread, f"{how} {key}", stated or given)
     if priors.distance.sd > 0:
-        how = f"[rig] distance_mm or distance_range_mm, or [uncertainty] distance_floor, {key}"
-        as_given = priors.distance == priors.distance_mm or (given and priors.distance_mm is not None)
-        add("distance of the tissue", f"{priors.distance} mm along the sightline", how, as_given)
+        told, raised = priors.distance_mm is not None, priors.distance not in (priors.distance_mm, UNTOLD_DISTANCE_MM)
+        how = "[rig] distance_mm or distance_range_mm" + ", or [uncertainty] distance_floor," * raised
+        as_given = told and (given or not raised)
+        add("distance of the tissue", f"{priors.distance} mm along the sightline", f"{how} {key}", as_given)
     camera, prior = calibration.camera, priors.camera
     told = not prior.guessed
     if prior.focal_sd > 0:

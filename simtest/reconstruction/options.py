@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from simtest.calibration import Calibration, Priors, Response
+from simtest.calibration.priors import OF_PICTURES
 from simtest.conventions import DEFAULT_SMOOTHING_PX
 from simtest.detection.colour import ColourDetector
 from simtest.detection.detector import Detector, load_detector
@@ -226,6 +227,8 @@ def choose(
 
     A picture has an encoding and a largest value; light of any scale, where `is_picture` is false, has neither.
     """
+    if is_picture and calibration.priors.floors is None:
+        calibration = replace(calibration, priors=replace(calibration.priors, floors=OF_PICTURES))
     known = complete(calibration, options.encoding) if is_picture else calibration
     given = options.detector
     if given is None:

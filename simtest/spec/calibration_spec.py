@@ -117,7 +117,7 @@ class RigCalibration(Spec):
 
 
 Floor = Annotated[float | None, Field(ge=0, le=100)]
-"""A least standard deviation, whatever else is given. One floor sets the others; without, there is none."""
+"""A least standard deviation; none below it is reported of a picture, whatever else is given."""
 
 FLOORS = {
     "light_sd_mm": ("light_floor_mm", None), "light_sd": ("light_floor_deg", "deg"),
@@ -149,21 +149,20 @@ class UncertaintyCalibration(Spec):
         "that is not uniform has no lights_mm beside the camera; else [0, 4]",
     )
     light_floor_mm: Floor = Field(
-        None, description="of a light without lights_covariance_mm2, an axis, mm; 0.2 with other floors"
+        None, description="of a light without lights_covariance_mm2, an axis, mm; default in pictures 0.2"
     )
-    light_floor_deg: Floor = Field(None, description="the same as seen from the camera, deg; 0.5 with other floors")
-    distance_floor: Floor = Field(None, description="of a given distance, share of it; 0.03 with other floors")
+    light_floor_deg: Floor = Field(None, description="the same as seen from the camera, deg; default in pictures 0.5")
+    distance_floor: Floor = Field(None, description="of a given distance, share of it; default in pictures 0.03")
     feature_floor_deg: Floor = Field(
-        None, description="of the normal by features finer than a pixel, an axis, deg; 0.4 with other floors"
+        None, description="of the normal by features finer than a pixel, an axis, deg; default in pictures 0.4"
     )
     response_floor: Floor = Field(
-        None,
-        description="of a highlight's centre by the response, share of its size; 0.05 with other floors",
+        None, description="of a highlight's centre by the response, share of its size; default in pictures 0.05"
     )
     off_peak: Floor = Field(
         None,
         description="an answer that looks farther off its peak than this share of its highlight's size is given at the "
-        "peak or refused; 0.05 with other floors, 0: none is",
+        "peak or refused; default in pictures 0.05, 0: none is",
     )
 
     @property

@@ -8,7 +8,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
 from simtest.calibration.photometry import AngularProfile
-from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
+from simtest.calibration.priors import NO_FLOORS, UNTOLD_FALLOFF_POWER
 from simtest.errors import InputError
 from simtest.runtime.arrays import short_repr
 from simtest.runtime.boundary import plain_errors
@@ -205,6 +205,7 @@ class Scene(Spec):
             None if mean is None else Normal(mean, mean * self.known.distance_sd),
             None if curvature is None else exactly(curvature),
             falloff_power=None if told else UNTOLD_FALLOFF_POWER,
+            floors=NO_FLOORS,
         )
 
 

@@ -14,6 +14,7 @@ from test_colour_detection import HEIGHT, WIDTH, lobe, picture
 
 import simtest
 from simtest.calibration import Calibration, Frame, NoiseModel, Priors, Response, exactly, srgb_encode
+from simtest.calibration.priors import NO_FLOORS
 from simtest.detection.colour import ColourDetector
 from simtest.errors import Failure, InputError
 from simtest.geometry import Camera
@@ -134,7 +135,7 @@ def test_a_field_of_view_is_told_alike(tmp_path):
 def test_the_calibration_states_what_is_not_inferred():
     calibration = Calibration(
         CAMERA, Response("gamma", 2.0), saturation_level=0.9,
-        priors=Priors(((4.0, 0.0, 0.0),), exactly(40.0)),
+        priors=Priors(((4.0, 0.0, 0.0),), exactly(40.0), floors=NO_FLOORS),
     )  # fmt: skip
     choices = reconstruct(tissue(), calibration).choices
     assert (choices.encoding, choices.saturation_level) == ("gamma", 0.9)

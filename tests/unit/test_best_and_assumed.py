@@ -343,7 +343,7 @@ def shaded(cut=0):
     return np.rint(255 * srgb_encode(light[cut:])).astype(np.uint8)
 
 
-def lit(height=160, floors=OF_PICTURES):
+def lit(height=160, floors=None):
     priors = Priors(((40.0, 0.0, 0.0),), exactly(100.0), falloff_power=None, floors=floors)
     return simtest.Calibration(simtest.Camera.from_fov(40.0, 200, height), priors=priors)
 
@@ -367,11 +367,11 @@ def test_off_its_peak_and_cut_is_refused():
     assert "off the peak" in found.detail
 
 
-def test_floors_that_are_given_stand_in_the_budget_and_none_stand_there_by_default():
+def test_pictures_have_floors_and_linear_frames_none():
     picture = np.rint(255 * srgb_encode(spot())).astype(np.uint8)
-    of_picture, open_ = (simtest.reconstruct(picture, lit(floors=f), ["bisector"]) for f in (OF_PICTURES, Floors()))
-    usual = simtest.reconstruct(picture, lit(floors=None), ["bisector"])
-    parts = [each[0].best_estimate.budget for each in (of_picture, open_, usual)]
+    of_picture, open_ = (simtest.reconstruct(picture, lit(floors=f), ["bisector"]) for f in (None, Floors()))
+    linear = simtest.reconstruct(spot(), lit(), ["bisector"])
+    parts = [each[0].best_estimate.budget for each in (of_picture, open_, linear)]
     assert np.trace(parts[0]["resolution"]) >= 2 * OF_PICTURES.feature_sd**2
     assert "light_offset" in parts[0]
     assert "response" in parts[0]
@@ -384,4 +384,8 @@ def test_floors_that_are_given_stand_in_the_budget_and_none_stand_there_by_defau
     }
     assert len(floors) == 4
     assert not any(named[what].given for what in floors)
-    assert not floors & {each.what for spots in (open_, usual) for each in spots.choices.assumed}
+    assert "light_floor_mm" in named["light positions"].how_to_narrow
+    assert "distance_floor" in named["distance of the tissue"].how_to_narrow
+    others = [each for spots in (open_, linear) for each in spots.choices.assumed]
+    assert not floors & {each.what for each in others}
+    assert not any("_floor" in each.how_to_narrow for each in others)

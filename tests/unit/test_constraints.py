@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Frame, Response, exactly
+from simtest.calibration.priors import NO_FLOORS
 from simtest.detection import Detection, Region
 from simtest.detection.view import View
 from simtest.errors import Failure, Reason
@@ -53,6 +54,7 @@ def stored(dk):
         distance_mm=exactly(DISTANCE),
         lobe_curvature=exactly(curvature),
         falloff_power=None,
+        floors=NO_FLOORS,
     )
     calibration = Calibration(CAMERA, Response(), priors=priors)
     options = Options(fov_deg=60.0, estimators=("curved",), roi=(40, 20, 94, 88))

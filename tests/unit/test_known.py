@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, CameraPrior, LogUniform, Normal, Priors, Uniform, exactly
+from simtest.calibration.priors import NO_FLOORS
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.bisector import bisector
@@ -136,7 +137,7 @@ def test_a_scene_says_it():
     assert (priors.distance_mm.mean, priors.distance_mm.sd) == (pytest.approx(8.0), pytest.approx(0.8))
     assert (priors.lights_mm, priors.lobe_curvature) == (((0.0, 0.0, 0.0),), exactly(200.0))
     silent = scene_from_dict({"surface": surface, "known": {"lights": False, "lobe": False}})
-    assert silent.calibration(10.0).priors == Priors(falloff_power=None)
+    assert silent.calibration(10.0).priors == Priors(falloff_power=None, floors=NO_FLOORS)
     unknown = scene_from_dict({"surface": surface, "sensor": {"vignetting_known": False}})
     assert unknown.calibration().priors.falloff_power == Priors().falloff_power
     with pytest.raises(InputError, match="exclude each other"):

@@ -37,6 +37,14 @@ distance_mm = 10.0
 distance_sd_mm = 0.5
 [surface]
 phong_exponent = 50.0
+# the frames are rendered
+[uncertainty]
+light_floor_mm = 0.0
+light_floor_deg = 0.0
+distance_floor = 0.0
+feature_floor_deg = 0.0
+response_floor = 0.0
+off_peak = 0.0
 """
 # d k, the camera's steps, mm, and what must be told; beyond its centre a highlight runs ahead of the camera.
 SHAPES = {
