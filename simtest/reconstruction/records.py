@@ -158,7 +158,7 @@ class Specularity:
         best, because = best_of(self.estimates, self.target)
         if best is not None and self.is_doubtful:
             below = f"its score {self.score:g} is below {self.least_score:g}"
-            return None, f"{below}: it may be no highlight; --least-score 0 keeps it"
+            return None, f"it may be no highlight, as {below}; --least-score 0 keeps it"
         return best, because
 
     @property

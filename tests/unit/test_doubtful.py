@@ -21,7 +21,7 @@ from simtest.reconstruction.sequence import reconstruct_sequence
 from simtest.validation.references import compare
 
 CAMERA = Camera.from_fov(60.0, 320, 240)
-BELOW = "its score 0.3 is below 0.4: it may be no highlight; --least-score 0 keeps it"
+BELOW = "it may be no highlight, as its score 0.3 is below 0.4; --least-score 0 keeps it"
 SENTENCE = "1 of 2 may be no highlights: their scores are below 0.4; --least-score 0 keeps them"
 
 
