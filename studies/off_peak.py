@@ -36,6 +36,7 @@ from simtest.rendering import Session
 from simtest.runtime.arrays import Image
 from simtest.runtime.seeds import from_integer
 from simtest.spec import scene_from_dict
+from simtest.validation.statistics import is_wrong_and_sure
 
 Row = dict[str, Any]
 FRAMES, SEED, TUNED_SEED = 150, 200, 100
@@ -120,9 +121,9 @@ def rows_of(body: str, count: int, seed: int) -> list[Row]:
     """Return the answers on the pictures of a kind, before and after."""
     rows: list[Row] = []
     for session, shown, calibration in frames(body, count, seed):
-        after = reconstruct(shown, calibration, ["bisector"])
+        after = reconstruct(shown, calibration, ["bisector"], least_score=0)
         exact = replace(calibration, priors=replace(calibration.priors, floors=NO_FLOORS))
-        before = reconstruct(shown, exact, ["bisector"])
+        before = reconstruct(shown, exact, ["bisector"], least_score=0)
         for old, new in zip(before, after, strict=True):
             if isinstance(old.patch, Failure) or old.best_estimate is None:
                 continue
@@ -143,17 +144,12 @@ def scored(specularity: Specularity, session: Session) -> tuple[float, float] | 
     return error, best.deviation_deg or 0.0
 
 
-def is_wrong_and_sure(answer: tuple[float, float] | None) -> bool:
-    """Whether an answer is off by more than 5 deg and by more than three times its ±."""
-    return answer is not None and answer[0] > 5 and answer[0] > 3 * answer[1]
-
-
 def summary(name: str, rows: Sequence[Row]) -> list[str]:
     """Describe a group of answers."""
     line = [name, str(len(rows))]
     for when in ("before", "after"):
         answers = [row[when] for row in rows if row[when] is not None]
-        wrong = sum(map(is_wrong_and_sure, answers))
+        wrong = sum(bool(is_wrong_and_sure(*answer)) for answer in answers)
         median = float(np.median([error for error, _ in answers])) if answers else float("nan")
         line += [str(len(answers)), f"{median:.2f}", f"{wrong} ({100 * wrong / max(len(answers), 1):.1f} %)"]
     return line
@@ -172,7 +168,7 @@ def main(arguments: Sequence[str]) -> int:
         f"{head}, {when}" for when in ("before", "after") for head in ("answered", "median, deg", "wrong and sure")
     ]
     print_markdown([["kind", "highlights", *heads], *(summary(name, group) for name, group in groups.items())])
-    return int(any(is_wrong_and_sure(row["after"]) for row in off))
+    return int(any(is_wrong_and_sure(*row["after"]) for row in off if row["after"] is not None))
 
 
 if __name__ == "__main__":

@@ -253,10 +253,12 @@ def _rows(session: Session, view: RenderedView, number: int, family: int) -> lis
 def _told_rows(
     session: Session, view: RenderedView, picture: Image, calibration: Calibration, about: Mapping[str, float | str]
 ) -> list[Row]:
-    made = run(picture, calibration, Options())
+    made = run(picture, calibration, Options(least_score=0))
     scored = score(session, view, made)
     with replaced.object(prior_parts, "CROWD", math.inf):
-        before = {spot.spot.index: spot for spot in score(session, view, run(picture, calibration, Options()))}
+        before = {
+            spot.spot.index: spot for spot in score(session, view, run(picture, calibration, Options(least_score=0)))
+        }
     count = len(made)
     crowd = "none" if count <= 3 else "few" if count <= 30 else "many"
     return [{**about, "crowd": crowd, **_numbers(spot, before.get(spot.spot.index))} for spot in scored]
@@ -268,7 +270,7 @@ def base_rows(session: Session, view: RenderedView, number: int, family: int) ->
     calibration = told(view, family)
     relief = view.scene.surface.relief
     assert relief is not None
-    made = run(picture, calibration, Options(estimators=default_estimators(calibration), target="base"))
+    made = run(picture, calibration, Options(estimators=default_estimators(calibration), target="base", least_score=0))
     slope = Priors(relief_slope=exactly(math.radians(relief.slope_deg)))
     by_slope = score(session, view, _having_relief(made, prior_parts.relief_part(slope)))
     # On a plane highlights are no steeper: the control is the part as it would be there.
@@ -306,7 +308,7 @@ def _base_rows(
 ) -> list[Row]:
     """Return the rows of what the picture says of the base's normals: single highlights, and clouds of them."""
     names = (*default_estimators(calibration), "cloud")
-    made = run(picture, calibration, Options(estimators=names, target="base"))
+    made = run(picture, calibration, Options(estimators=names, target="base", least_score=0))
     rows: list[Row] = [
         {
             **about,

@@ -150,6 +150,8 @@ class PartScore(Form):
     scenes: dict[Text, list[SceneSum]]
     uncertainty: UncertaintyScore
     results: Hash  # of the rows
+    # Share of the answers that are wrong and sure (`simtest.validation.statistics`); earlier certificates lack it
+    wrong_and_sure: Share | None = None
     # Of maps alone
     source: Text | None = None
     zones: dict[Text, ZoneScore] | None = None
@@ -242,6 +244,7 @@ def score_part(rows: pl.DataFrame, layout: Layout) -> PartScore:
         scenes=scenes,
         uncertainty=score_uncertainty(answered, *scenes_of(answered, layout)),
         results=results_hash(rows),
+        wrong_and_sure=told.wrong_and_sure,
     )
 
 

@@ -56,8 +56,8 @@ IntMatrix = npt.NDArray[np.int8]
 PAGE = "index.html"
 MOST_CERTIFICATES = 1000
 
-COLUMNS = ("median", "mean", "p95", "score", "answered", "refused", "missed", "coverage", "verdict", "95 % axis",
-           "energy")  # fmt: skip
+COLUMNS = ("median", "mean", "p95", "score", "answered", "refused", "missed", "coverage",
+           "wrong and sure", "verdict", "95 % axis", "energy")  # fmt: skip
 """Headings of `part_cells`; errors, axis and score are in deg."""
 
 NONE = "–"
@@ -359,6 +359,7 @@ def part_cells(told: Mapping[str, Any]) -> tuple[str, ...]:
         str(sum(told["refused"].values())),
         str(told["missed"]),
         coverage(uncertainty),
+        NONE if (share := told.get("wrong_and_sure")) is None else f"{100 * share:.1f} %",
         uncertainty["verdict"],
         degrees(uncertainty["semi_axis_deg"]),
         degrees(uncertainty["energy_deg"]),

@@ -230,6 +230,13 @@ class PictureOptions:
     keep_overlays: Annotated[
         bool, flag("Found by colour: take text and squares that are drawn on the picture for tissue.")
     ] = False
+    least_score: Annotated[
+        float | None,
+        about(
+            "Highlights with a smaller score, in [0, 1], may be none and have no best normal; 0 keeps all. "
+            "The score is no probability; its default was fitted on rendered foolers."
+        ),
+    ] = None
 
     def checked(self, **others: Any) -> "Options":
         """Return them, and others, as the reconstruction takes them; raise `InputError` where they are malformed."""

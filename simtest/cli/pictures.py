@@ -147,11 +147,12 @@ def record_tables(spots: "Specularities") -> "Iterator[str | Table]":
         yield from (f"reference: {problem}" for problem in compared.problems)
         rows = [
             (name, str(errors.n), _pair(errors.mean_deg, errors.std_deg),
-             _pair(errors.mean_oracle_deg, errors.std_oracle_deg), _share(errors.inside), _share(errors.inside_organ))
+             _pair(errors.mean_oracle_deg, errors.std_oracle_deg), _share(errors.inside), _share(errors.inside_organ),
+             _share(errors.wrong_and_sure))
             for name, errors in compared.rows.items()
         ]  # fmt: skip
         of_errors = ("estimator", "n", "mean ± std (deg)", "better candidate (deg)")
-        yield Table((*of_errors, "inside its 95 %", "the organ's 95 %"), rows)
+        yield Table((*of_errors, "inside its 95 %", "the organ's 95 %", "wrong and sure"), rows)
         yield f"{compared.missed} sightlines miss {compared.source}"
 
 
@@ -213,7 +214,9 @@ def count_lines(spots: "Specularities", image: Path) -> "Iterator[str]":
     others = spots.detection.others
     answered = sum(spot.best is not None for spot in spots)
     found = f"{counted(len(spots), 'specularity', 'specularities')} found in {image}"
-    yield found + (f", {answered} with a normal" if answered < len(spots) else "")
+    yield found + (f", {answered} with a best normal" if answered < len(spots) else "")
+    if spots.doubts:
+        yield f"note: {spots.doubts}"
     if others:
         kinds = kinds_counted(each.kind for each in others)
         left = f"{counted(len(others), 'more highlight')} found and left out"
@@ -286,6 +289,8 @@ def _twin_parts(result: "TwinResult") -> "Iterator[str | Table]":
     if len(spots) > MOST_ROWS:
         yield f"the {MOST_ROWS} largest of {len(spots)}; twin.csv and index.html hold all"
     held = "" if result.coverage is None else f"; their 95 % regions hold the truth in {100 * result.coverage:.0f} %"
+    if result.wrong_and_sure is not None:
+        held += f", {100 * result.wrong_and_sure:.0f} % are wrong and sure"
     yield f"twins: {result.rms_deg():.2f} deg RMS against the fine normal{held}"
     yield f"twins: {result.rms_deg('base_rms_deg'):.2f} deg RMS against the base's normal"
     drawn = f"{counted(len(result.bank), 'rendered frame')}, {counted(len(result.bank_spots), 'highlight')} in them"

@@ -397,7 +397,7 @@ def _night_parts(outcome: "Outcome") -> "Iterator[str | Table]":
 
 bench = App(name="bench", help="Run the frozen benchmark, make a table of its certificates.")
 
-BENCH_WIDTH = 170
+BENCH_WIDTH = 185
 """Columns of the table of parts; in fewer its words would be cut."""
 
 SuiteVersion = Annotated[str, about("Version of the suite.", "--suite")]

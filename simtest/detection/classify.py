@@ -142,7 +142,7 @@ def classify(spots: list[SpecularSpot], picture: ColourPicture, bright: Mask) ->
             spot, box, sets[0], *_shape(fits), at_border, clipped, white, *_around(spot, box, picture, bright)
         )
         kind = _kind(one)
-        judged.append(None if _is_pale(one, kind, max(smoothed.shape)) else _highlight(one, kind, picture.light.noise))
+        judged.append(None if _is_pale(one, kind, max(smoothed.shape)) else _highlight(one, kind))
     return judged
 
 
@@ -218,16 +218,12 @@ def _is_pale(one: Measured, kind: Kind, longer_side_px: int) -> bool:
     return one.surround > (PALE_WIDE if area >= WIDE_PX else PALE) and not glaring
 
 
-def _highlight(one: Measured, kind: Kind, noise: float) -> Highlight:
-    """Return the highlight of a spot, with its score."""
-    spot, score = one.spot, 0.0
-    if one.axis_ratio is not None and one.residual is not None and one.wander is not None:
-        height = spot.value / (spot.value + max(10 * noise, 1e-6))
-        misfit = (one.residual / RESIDUAL) ** 2 + (one.wander / WANDER) ** 2
-        score = float(np.exp(-misfit / 4) * min(max(one.tint, 0), 1) * height)
+def _highlight(one: Measured, kind: Kind) -> Highlight:
+    """Return the highlight of a spot."""
+    spot = one.spot
     column, row = (int(v) for v in spot.peaks[0])
     return Highlight(
-        Region(one.box, (column, row), spot.value), kind, round(score, 4), spot.area_px, one.axis_ratio, one.residual,
+        Region(one.box, (column, row), spot.value), kind, spot.area_px, one.axis_ratio, one.residual,
         one.wander, one.tint, one.clutter, _outline(one), spot.peaks if kind is Kind.CLUSTER else spot.peaks[:1],
         one.clipped_px / spot.area_px,
     )  # fmt: skip

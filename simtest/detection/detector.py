@@ -66,8 +66,6 @@ class Highlight:
         Region of interest; its contrast is the specular light at the peak, share of full scale.
     kind : Kind
         Its kind.
-    score : float
-        In [0, 1]: likeness of shape, colour and height to an isolated highlight's.
     area_px : int
         Pixels above half of its peak, a cluster's above half of its peaks and the saddles between them.
     axis_ratio, residual, wander : float or None
@@ -90,7 +88,6 @@ class Highlight:
 
     region: Region
     kind: Kind
-    score: float
     area_px: int
     axis_ratio: float | None
     residual: float | None

@@ -80,6 +80,9 @@ UNTOLD_ERROR = {
 
 TERMS = {
     "best": "The best normal of a highlight has the smallest reported error. Normals without one come last.",
+    "score": "The score, 0 to 1, says how much a spot looks like a highlight. It is no probability, and was fitted on "
+    "rendered spots that fool (docs/measured/foolers.md). Below the least score a spot has no best normal. ± holds if "
+    "it is a highlight.",
     "tilt": "Tilt is the angle between the normal and the camera's optical axis: 0° faces the camera.",
     "deviation": "± is the root mean square error that is expected of the normal, all parts of its budget together. "
     "The error should stay below 1.7 to 2 times this figure for 95 % of the normals.",

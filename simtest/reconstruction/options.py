@@ -81,6 +81,8 @@ class Options:
         Of the camera over the frames of a sequence: tells convex from concave (`simtest.reconstruction.motion`).
     keep_overlays : bool
         Found by colour, take text and squares that are drawn on the picture for tissue.
+    least_score : float, optional
+        Highlights with a smaller score have no best normal; 0 keeps all. Default `LEAST_SCORE`.
     """
 
     camera: Path | None = None
@@ -95,6 +97,7 @@ class Options:
     fov_of: Extent = "width"
     poses: Path | None = None
     keep_overlays: bool = False
+    least_score: float | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.detector, str) and self.detector != AUTO:
@@ -104,10 +107,11 @@ class Options:
                 raise InputError(f"{error}; {AUTO} chooses among those of simtest") from error
         if not isinstance(self.target, str) or self.target not in TARGETS:
             raise InputError(f"target = {shown(self.target)}: must be one of {', '.join(TARGETS)}")
-        width = self.smoothing_px
-        number = isinstance(width, int | float | np.number) and not isinstance(width, bool)
-        if width is not None and not (number and 0 <= width <= MAX_SMOOTHING_PX):
-            raise InputError(f"smoothing_px = {width!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
+        for key, most in (("smoothing_px", MAX_SMOOTHING_PX), ("least_score", 1)):
+            value = getattr(self, key)
+            number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+            if value is not None and not (number and 0 <= value <= most):
+                raise InputError(f"{key} = {value!r}: must be a number in [0, {most}]")
         names = () if self.estimators is None or isinstance(self.estimators, Mapping) else self.estimators
         if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
             raise InputError(f"estimators = {shown(names)}: must be a list of names")

@@ -51,7 +51,7 @@ def write_picture_page(path: Path, spots: Specularities, picture: Image) -> None
         "spots": drawn,
         "others": [
             {"kind": explanations.kind_name(h.kind), "outline": _rounded(h.outline, 1),
-             "peak": np.add(h.region.peak, 0.5).tolist(), "score": h.score, "id": number}
+             "peak": np.add(h.region.peak, 0.5).tolist(), "id": number}
             for number, h in [
                 *((None, h) for h in spots.detection.others),
                 *((s.id, s.highlight) for s in spots if s.highlight and s.peak_px is None),
@@ -223,7 +223,7 @@ def _best_cells(spot: Specularity, rule: Sequence[str]) -> tuple[object, ...]:
     best = spot.best_estimate
     kind = kind_name(spot.kind) or ("cloud" if best is not None and best.cloud is not None else "")
     if best is None:
-        return (spot.id, kind, "no normal", "", "", "", spot.best_because)
+        return (spot.id, kind, "none", "", "", "", spot.best_because)
     return (spot.id, kind, SIGHTLINE_RULE if spot.best in rule else spot.best, *_cells("", best)[1:])
 
 

@@ -27,6 +27,7 @@ from simtest.reconstruction.assumptions import border_note, calibration_of_view,
 from simtest.reconstruction.images import check_frame, check_size, image_size, read_picture
 from simtest.reconstruction.options import CLOUD, SMOOTHING_BY_COLOUR_PX, Options, check_encoding, choose
 from simtest.reconstruction.records import Specularities, Specularity
+from simtest.reconstruction.scores import LEAST_SCORE, highlight_score
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.boundary import plain_errors
 from simtest.runtime.messages import LOGGER
@@ -57,6 +58,7 @@ def reconstruct(
     target: Target = "fine",
     encoding: str | None = None,
     keep_overlays: bool = False,
+    least_score: float | None = None,
 ) -> Specularities:
     """Reconstruct the normals at a frame's isolated specularities.
 
@@ -97,6 +99,8 @@ def reconstruct(
         picture too where they are said to be "srgb".
     keep_overlays : bool
         Found by colour, take text and squares that are drawn on the picture for tissue; default: they are masked.
+    least_score : float, optional
+        Highlights with a smaller score, which may be none, have no best normal; 0 keeps all. Default `LEAST_SCORE`.
 
     Returns
     -------
@@ -142,7 +146,7 @@ def reconstruct(
         image, is_picture = check_frame(frame, camera.camera, encoding)
     options = Options(
         estimators=estimators, roi=roi, encoding=encoding, every=not isolated, detector=detector,
-        smoothing_px=smoothing_px, target=target, keep_overlays=bool(keep_overlays),
+        smoothing_px=smoothing_px, target=target, keep_overlays=bool(keep_overlays), least_score=least_score,
     )  # fmt: skip
     spots = run(image, camera, options, is_picture)
     spots.image, spots.warnings = name, cautions
@@ -267,8 +271,8 @@ def _estimate(
         else replace(patch, others_px=(*peaks[:i], *peaks[i + 1 :]), others_value=(*values[:i], *values[i + 1 :]))
         for i, patch in enumerate(cut[: len(regions)])
     ]
-    prepare(list(estimators.values()), patches, frame.calibration.camera)
-    priors = frame.calibration.priors
+    camera, priors = frame.calibration.camera, frame.calibration.priors
+    prepare(list(estimators.values()), patches, camera)
     relief = relief_part(priors)
     answers = {name: run_in_frame(each, frame, patches, priors) for name, each in estimators.items()}
     no_cloud = None
@@ -276,16 +280,19 @@ def _estimate(
         of_patches = zip(answers.pop(CLOUD).of_patches, patches, strict=True)
         failures = [each for each, patch in of_patches if isinstance(each, Failure) and each is not patch]
         no_cloud = failures[0] if failures else Failure(Reason.NO_ESTIMATE, "no highlight was found")
+    least = LEAST_SCORE if options.least_score is None else options.least_score
     spots = []
     for i, (region, patch, highlight) in enumerate(zip(regions, patches, highlights, strict=True)):
         given = {name: each.of_patches[i] for name, each in answers.items()}
         results = {name: result for name, result in given.items() if result is not None}
+        score = None if isinstance(patch, Failure) else highlight_score(patch, highlight, frame, results)
         if not isinstance(patch, Failure):
             small = highlight is not None and math.sqrt(highlight.area_px / math.pi) < SMALL_RADIUS * frame.smoothing_px
             dim = highlight is not None and highlight.dim
             results = {name: _flagged(each, patch, frame, small, dim) for name, each in results.items()}
         organ = {name: to_base(each, relief) for name, each in results.items() if isinstance(each, Estimate)}
-        spots.append(Specularity(region, patch, results, highlight, frame.calibration.camera, options.target, organ))
+        score = score and round(score, 4)
+        spots.append(Specularity(region, patch, results, highlight, camera, options.target, organ, score, least))
     box = options.roi
     undetected = [
         _undetected(name, estimate, frame, options.target, relief)

@@ -78,6 +78,10 @@ class Specularity:
     organ : mapping
         The same results as normals of the organ below its relief, whose slope is in their budgets
         (`simtest.estimators.prior_parts.to_base`).
+    score : float, optional
+        How much it looks like a highlight, in [0, 1]: no probability. None for clouds, and where nothing was detected.
+    least_score : float
+        With a smaller score it has no best estimate.
     id : int
         Its place among those of the frame.
     track : int, optional
@@ -102,6 +106,8 @@ class Specularity:
     camera: Camera | None = None
     target: Target = "fine"
     organ: Mapping[str, Estimate] = field(default_factory=dict)
+    score: float | None = None
+    least_score: float = 0.0
     id: int = 0
     track: int | None = None
     reference: Any = None
@@ -138,9 +144,9 @@ class Specularity:
         return None if self.highlight is None else str(self.highlight.kind)
 
     @property
-    def score(self) -> float | None:
-        """How sure the detector is of that."""
-        return None if self.highlight is None else self.highlight.score
+    def is_doubtful(self) -> bool:
+        """Whether it may be no highlight: its score is below the least one."""
+        return self.score is not None and self.score < self.least_score
 
     @property
     def normals(self) -> dict[str, Estimate]:
@@ -149,11 +155,15 @@ class Specularity:
 
     @cached_property
     def _judged(self) -> tuple[str | None, str]:
-        return best_of(self.estimates, self.target)
+        best, because = best_of(self.estimates, self.target)
+        if best is not None and self.is_doubtful:
+            below = f"its score {self.score:g} is below {self.least_score:g}"
+            return None, f"it may be no highlight, as {below}; --least-score 0 keeps it"
+        return best, because
 
     @property
     def best(self) -> str | None:
-        """Name of the estimator whose normal is the best one."""
+        """Name of the estimator whose normal is the best one; None where all failed, or it may be no highlight."""
         return self._judged[0]
 
     @property
@@ -200,6 +210,7 @@ class Specularity:
             "peak_px": self.peak_px,
             "sightline": sightline,
             **({} if self.highlight is None else _highlight_json(self.highlight)),
+            "score": self.score,
             "best": self.best,
             "best_because": self.best_because,
             "estimates": {
@@ -276,6 +287,13 @@ class Specularities(list[Specularity]):
     def counted(self) -> str:
         """How many there are, in words."""
         return "1 specularity" if len(self) == 1 else f"{len(self)} specularities"
+
+    @property
+    def doubts(self) -> str:
+        """How many of them may be no highlights, in a sentence; an empty text where none may."""
+        least = [spot.least_score for spot in self if spot.is_doubtful]
+        below = f"{len(least)} of {len(self)} may be no highlights: their scores are below"
+        return f"{below} {least[0]:g}; --least-score 0 keeps them" if least else ""
 
     @property
     def clouds(self) -> list[Specularity]:
@@ -369,8 +387,8 @@ class Specularities(list[Specularity]):
         return pl.DataFrame([*normals_rows(entries)], schema=list(COLUMNS), orient="row", infer_schema_length=None)
 
     def __repr__(self) -> str:
-        answered = sum(bool(each.normals) for each in self)
-        text = f"{self.counted}, {answered} with a normal; {self.choices}"
+        answered = sum(each.best is not None for each in self)
+        text = f"{self.counted}, {answered} with a best normal; {self.choices}"
         return f"<Specularities: {clipped(text, LONGEST - 18)}>"
 
     def _repr_html_(self) -> str:
@@ -495,7 +513,6 @@ def _view_json(view: View) -> JsonObject | None:
 def _highlight_json(highlight: Highlight) -> JsonObject:
     return {
         "kind": highlight.kind,
-        "score": highlight.score,
         "area_px": highlight.area_px,
         "peaks": max(len(highlight.peaks), 1),
         "clipped": round(highlight.clipped, 3),

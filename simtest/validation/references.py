@@ -34,6 +34,7 @@ from simtest.validation.depth_maps import (
     read_depth,
     read_values,
 )
+from simtest.validation.statistics import is_wrong_and_sure
 
 ROTATION_TOLERANCE = 1e-3
 """Largest difference of R^T R from the identity, entry by entry: poses are written with a few digits."""
@@ -44,13 +45,14 @@ class ErrorRecord:
     """Angle to a reference, deg: of the proposed normal, and of the better candidate; and whether regions hold it.
 
     `inside` is of the 95 % region that the estimate states, `inside_organ` of that of the organ's normal; None where
-    there is none.
+    there is none, as `wrong_and_sure` (`simtest.validation.statistics`) is without a reported deviation.
     """
 
     error_deg: float
     error_oracle_deg: float
     inside: bool | None
     inside_organ: bool | None
+    wrong_and_sure: bool | None
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,8 @@ class ReferenceRecord:
 class ErrorSummary:
     """An estimator's errors against a reference, deg, and the shares of its 95 % regions that hold the reference.
 
-    A single error has no spread, and without a region there is no share.
+    Beside them stands the share of the answers that are wrong and sure. A single error has no spread, and without a
+    region there is no share.
     """
 
     n: int
@@ -79,6 +82,7 @@ class ErrorSummary:
     std_oracle_deg: float | None
     inside: float | None
     inside_organ: float | None
+    wrong_and_sure: float | None
 
 
 @dataclass(frozen=True)
@@ -278,7 +282,7 @@ def compare(spots: Specularities, reference: Reference) -> None:
 
     Each specularity that has a peak, or is a cloud, gets the reference's normal and the errors of the estimators, deg:
     of the proposed normal, and of the better candidate, as the article chooses by hand. Their means and standard
-    deviations by estimator become the picture's own ``reference``.
+    deviations by estimator become the picture's own ``reference``; those of what may be no highlight are left out.
     """
     # Without a peak a cloud alone has a normal.
     looks = [None if spot.peak_px is None and not spot.normals else spot.position_px for spot in spots]
@@ -289,17 +293,18 @@ def compare(spots: Specularities, reference: Reference) -> None:
         for spot, look in zip(spots, looks, strict=True)
     ]
     # summarise the sightlines that meet the reference
-    met = [spot.reference.errors for spot in spots if spot.reference is not None and spot.reference.normal is not None]
-    names, rule = dict.fromkeys(name for errors in met for name in errors), spots.sightline_rule
+    met = [spot for spot in spots if spot.reference is not None and spot.reference.normal is not None]
+    kept = [spot for spot in met if not spot.is_doubtful]
+    compared = [spot.reference.errors for spot in kept]
+    names, rule = dict.fromkeys(name for errors in compared for name in errors), spots.sightline_rule
     # One normal a highlight: of the best of them, as it is shown.
-    best = [spot.best for spot in spots if spot.reference is not None and spot.reference.normal is not None]
-    of_rule = [errors[name] for errors, name in zip(met, best, strict=True) if name in rule]
+    of_rule = [spot.reference.errors[spot.best] for spot in kept if spot.best in rule]
     spots.reference = ComparisonRecord(
         source=reference.source,
-        problems=list(reference.notes),
-        compared=len(met),
+        problems=[*reference.notes, *([f"left out: {spots.doubts}"] if spots.doubts else [])],
+        compared=len(compared),
         missed=len(peaks) - len(met),
-        estimators={name: _summary([errors[name] for errors in met if name in errors]) for name in names},
+        estimators={name: _summary([errors[name] for errors in compared if name in errors]) for name in names},
         sightline_rule=rule,
         of_sightline_rule=_summary(of_rule) if of_rule else None,
     )
@@ -315,6 +320,9 @@ def _errors(spot: Specularity, normal: Array) -> ReferenceRecord:
             float(own.min()),
             _is_inside(spot.normals[name], normal),
             _is_inside(spot.organ.get(name), normal),
+            None
+            if (deviation := spot.normals[name].deviation_deg) is None
+            else bool(is_wrong_and_sure(own[0], deviation)),
         )
         for name, own in angles.items()
     }
@@ -333,8 +341,9 @@ def _is_inside(estimate: Estimate | None, normal: Array) -> bool | None:
 def _summary(errors: Sequence[ErrorRecord]) -> ErrorSummary:
     pairs = np.array([(error.error_deg, error.error_oracle_deg) for error in errors])
     spread = pairs.std(axis=0, ddof=1).tolist() if len(pairs) > 1 else (None, None)
-    inside, organ = ([v for e in errors if (v := getattr(e, name)) is not None] for name in ("inside", "inside_organ"))
-    shares = [sum(held) / len(held) if held else None for held in (inside, organ)]
+    judged = ("inside", "inside_organ", "wrong_and_sure")
+    known = ([v for e in errors if (v := getattr(e, name)) is not None] for name in judged)
+    shares = [sum(held) / len(held) if held else None for held in known]
     return ErrorSummary(len(pairs), float(pairs[:, 0].mean()), spread[0], float(pairs[:, 1].mean()), spread[1], *shares)
 
 

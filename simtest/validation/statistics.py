@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import polars as pl
 from pydantic import BaseModel, ConfigDict, Field
 
 from simtest.conventions import MOTION, MOTION_COLUMNS, ON_INSTRUMENT
 from simtest.runtime import chi_squared
-from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.statistics import CONFIDENCE, Interval, mean_interval, root_mean_square, share_interval
 
 KINDS = ("ok", "failed", "missed", "false", ON_INSTRUMENT, "in_spot")
@@ -60,6 +61,16 @@ PENALTY_DEG = 90.0
 """What a failed or missed row counts in mean_penalised_deg: refusing is no way to a good figure."""
 
 
+WRONG_DEG, SURE = 5.0, 3.0
+"""Wrong and sure: an error of more than this, and of more than so many times the reported deviation."""
+
+
+def is_wrong_and_sure(error_deg: npt.ArrayLike, deviation_deg: npt.ArrayLike | None) -> Mask:
+    """Return which errors are above both bounds; none is whose deviation is not reported, NaN or None."""
+    errors, deviations = np.asarray(error_deg, dtype=float), np.asarray(deviation_deg, dtype=float)
+    return (errors > WRONG_DEG) & (errors > SURE * deviations)
+
+
 class Figures(BaseModel):
     """Figures of the rows of one setting and estimator, with their headings; None where nothing answered.
 
@@ -86,6 +97,8 @@ class Figures(BaseModel):
         Confidence interval of the mean, frames being the independent units.
     coverage95 : float or None
         Share of the answers with an uncertainty whose 95 % region holds the true normal.
+    wrong_and_sure : float or None
+        Share of the answers with a covariance that `is_wrong_and_sure`.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -109,6 +122,7 @@ class Figures(BaseModel):
     mean_penalised_deg: float | None = Field(title="mean, failures as\u00a090°")
     ci95_deg: Interval = Field(title="95\u00a0% interval\u00a0°")
     coverage95: float | None = Field(title="coverage 95\u00a0%")
+    wrong_and_sure: float | None = Field(None, title="wrong and sure")
 
 
 def summarise(results: pl.DataFrame) -> dict[str, dict[str, Figures]]:
@@ -128,6 +142,9 @@ def figures(rows: pl.DataFrame) -> Figures:
     errors = answered["error_deg"].to_numpy()
     penalised = np.concatenate([errors, np.full(count["true"] - len(errors), PENALTY_DEG)])
     distances = answered["mahalanobis2"].drop_nulls().to_numpy()
+    stated = answered.drop_nulls("cov_11")
+    variances = (stated["cov_11"] + stated["cov_22"]).to_numpy()
+    wrong = is_wrong_and_sure(stated["error_deg"].to_numpy(), np.degrees(np.sqrt(variances.clip(0))))
     low, high = mean_interval(errors, *units(answered))
     return Figures(
         n=count["true"],
@@ -150,11 +167,12 @@ def figures(rows: pl.DataFrame) -> Figures:
         # An angle is not negative, nor is its mean.
         ci95_deg=(None if low is None else max(low, 0.0), high),
         coverage95=float(np.mean(distances <= chi_squared.quantile(CONFIDENCE, 2))) if len(distances) else None,
+        wrong_and_sure=_or_none(np.mean, wrong),
         **({"n_instrument": count[ON_INSTRUMENT]} if ON_INSTRUMENT in rows.columns else {}),
     )
 
 
-def _or_none(statistic: Callable[[Array], Any], values: Array) -> float | None:
+def _or_none(statistic: Callable[[Any], Any], values: Array | Mask) -> float | None:
     return float(statistic(values)) if len(values) else None
 
 

@@ -25,6 +25,7 @@ from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image
 from simtest.simulation.frame import render_picture
 from simtest.spec import Scene, load_scene, scene_from_dict
+from simtest.validation.statistics import is_wrong_and_sure
 from studies.kept import of_this_code, write_arrays
 
 ORGANS = ("colon", "liver", "gallbladder")
@@ -41,9 +42,6 @@ STRIDE = 4
 SMOOTHING_PX = 1.0
 REGION = 3.0
 """Squared radius of the 95 % region over the mean square of the error."""
-
-SURE, SURE_DEG = 3.0, 5.0
-"""Wrong and sure: so many times the stated error, and by so much."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +148,7 @@ def line(name: str, held: Sequence[Read]) -> str:
     if not answered:
         return f"{start} 0 | | | | | |"
     error, radius = np.array([answer for each in held for answer in each.answers]).T
-    sure = np.count_nonzero((error > SURE * radius / math.sqrt(REGION)) & (error > SURE_DEG))
+    sure = np.count_nonzero(is_wrong_and_sure(error, radius / math.sqrt(REGION)))
     return (
         f"{start} {len(error)} | {np.median(error):.1f} | {np.quantile(error, 0.95):.1f} | {np.mean(radius):.1f} | "
         f"{100 * np.mean(error <= radius):.0f} % | {sure} |"

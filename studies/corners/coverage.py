@@ -10,6 +10,7 @@ from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.rendering import HighlightPoint
 from simtest.runtime.arrays import Array
+from simtest.validation.statistics import is_wrong_and_sure
 from studies.corners import formulas
 from studies.corners.case import Case
 from studies.corners.scenes import FACTORS, SMOOTH
@@ -18,9 +19,6 @@ REACH_PX = 2.5
 """A detection is of the nearest highlight within this, or within `REACH` of its box's shorter side."""
 
 REACH = 0.3
-
-WRONG_DEG, SURE = 5.0, 3.0
-"""Wrong and sure: an error of more than this, and of more than so many times what is reported."""
 
 NOMINAL, LEAST, LOWEST = 0.95, 0.92, 0.90
 """What regions are to hold, and hold at least: where all answers are pooled, and at each level."""
@@ -140,7 +138,7 @@ def table(answers: Sequence[Answer], rows: Sequence[dict[str, str]]) -> tuple[li
     lines += ["", "| wrong and sure | answers | wrong and sure | of highlights | of others |", "|---|---|---|---|---|"]
     for smooth, limit in ((True, WRONG_SMOOTH), (False, WRONG_TISSUE)):
         chosen = [e for e in answers if e.smooth == smooth and e.reported_deg is not None]
-        wrong = [e for e in chosen if e.error_deg > max(WRONG_DEG, SURE * (e.reported_deg or 0.0))]
+        wrong = [e for e in chosen if is_wrong_and_sure(e.error_deg, e.reported_deg or 0.0)]
         of_highlights = sum(e.matched for e in wrong)
         share = len(wrong) / max(len(chosen), 1)
         kind = "smooth" if smooth else "tissue"

@@ -21,7 +21,7 @@ NORMALS = {
     "the keys from kind to outline of the next table",
     "provenance": "versions and machine",
     "reference": "with `--reference` only: source, problems, compared, missed, and by estimator n, mean_deg, std_deg, "
-    "mean_oracle_deg, std_oracle_deg, inside, inside_organ (shares of 95 % regions that hold it)",
+    "mean_oracle_deg, std_oracle_deg, inside, inside_organ (shares of 95 % regions that hold it), and wrong_and_sure",
 }
 """Keys of normals.json."""
 
@@ -31,12 +31,12 @@ SPECULARITY = {
     "peak_px": "brightest point, px; null where the region has none",
     "sightline": "unit vector through the peak, camera frame; null where the lens images none",
     "kind": "`specular`, or another kind of highlight; by colour alone",
-    "score": "how clearly it is of that kind; by colour alone",
     "area_px": "by colour alone", "peaks": "number of its peaks; by colour alone",
     "clipped": "share of clipped pixels; by colour alone",
     "specular_peak": "height over its surroundings; by colour alone",
     "shape": "axis_ratio, residual, wander, tint, clutter; by colour alone", "outline": "px; by colour alone",
-    "best": "name of the estimator whose normal is the best; null where all failed",
+    "score": "how much it looks like a highlight, 0 to 1, fitted on rendered foolers: no probability; null for clouds",
+    "best": "name of the estimator whose normal is the best; null where all failed, or the score is too small",
     "best_because": "why, in words",
     "estimates": "by estimator: the next table",
     "track": "in folders and videos: number of the same specularity over frames",

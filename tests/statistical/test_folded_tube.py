@@ -28,7 +28,7 @@ def test_the_best_of_the_defaults_in_a_folded_tube():
         session = session or Session(scene)
         view = render_view(session, scene)
         true = [highlight for highlight in view.highlights if highlight.isolated]
-        found = reconstruct(view.frame(viewpoint), scene.calibration(None), DEFAULT_ESTIMATORS)
+        found = reconstruct(view.frame(viewpoint), scene.calibration(None), DEFAULT_ESTIMATORS, least_score=0)
         for i, j in match(found, [highlight.bp_px for highlight in true]).items():
             for errors, estimate in ((best, found[i].best_estimate), (mean_axis, found[i].normals.get("cone_axis"))):
                 if estimate is not None:

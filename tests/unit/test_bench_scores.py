@@ -17,7 +17,7 @@ from simtest.bench.scores import (
     score_uncertainty,
     verdict_of,
 )
-from simtest.bench.table import ALPHA, SceneSums, margin, rank
+from simtest.bench.table import ALPHA, COLUMNS, SceneSums, margin, part_cells, rank
 from simtest.geometry.vectors import basis_across
 from simtest.validation.columns import table
 
@@ -198,6 +198,13 @@ def test_an_error_beyond_the_cap_counts_the_cap() -> None:
     rows = _rows(4).with_columns(error_deg=pl.Series([1.0, 9.0, 11.0, 170.0]))
     score = score_part(rows, LAYOUT)
     assert (score.score_deg, score.mean_deg) == (pytest.approx(7.5), pytest.approx(47.75))
+    # Three of the four are off by more than 5 deg, and the rows state about 1 deg.
+    assert score.wrong_and_sure == pytest.approx(0.75)
+    told = dict(zip(COLUMNS, part_cells(score.to_json()), strict=True))
+    assert (told["wrong and sure"], told["coverage"][:5]) == ("75.0 %", "100.0")
+    # A certificate of an earlier release has none.
+    without = {key: value for key, value in score.to_json().items() if key != "wrong_and_sure"}
+    assert dict(zip(COLUMNS, part_cells(without), strict=True))["wrong and sure"] == "–"
     assert score.scenes["plane"][0] == (4, 30.0)
 
 

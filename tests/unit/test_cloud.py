@@ -326,6 +326,7 @@ def test_clouds_reach_normals_json_and_the_drawings():
     assert width > 40
     assert all("cloud" not in other.estimates for other in made[:-1])
     (record,) = [spot for spot in made if spot.best == "cloud"]
+    assert record.score is None
     (outline,) = record.drawings["cloud"].curves
     area = cv2.contourArea(np.array(outline, dtype=np.float32))
     values = np.linalg.eigvalsh(last.estimates["cloud"].cloud.covariance)

@@ -434,4 +434,3 @@ def test_pictures_of_any_size_and_content_are_borne(shape):
         found = detect_in_picture(np.ascontiguousarray(picture_, dtype=np.float32))
         assert found.detection.mask.shape == shape
         assert np.isfinite(found.detection.light.specular).all()
-        assert all(0 <= highlight.score <= 1 for highlight in found.detection.highlights)

@@ -100,9 +100,7 @@ def highlight(x, y, radius, *more):
     peaks = np.array([(int(x), int(y)), *more])
     kind = Kind.CLUSTER if more else Kind.ISOLATED
     area = round(np.pi * radius**2)
-    return Highlight(
-        Region((0, 0, 9, 9), (int(x), int(y)), 1.0), kind, 1.0, area, 1.0, 0.0, 0.0, 1.0, 0.0, outline, peaks
-    )
+    return Highlight(Region((0, 0, 9, 9), (int(x), int(y)), 1.0), kind, area, 1.0, 0.0, 0.0, 1.0, 0.0, outline, peaks)
 
 
 def test_outlines_are_filled_where_they_are():

@@ -191,7 +191,7 @@ def test_the_regions_hold_on_rendered_rough_tissue_and_not_without_the_part(monk
     picture = np.asarray(np.rint(255 * view.frame(1)) / 255, dtype=np.float32)
 
     def shares():
-        found = run(picture, view.calibration, Options())
+        found = run(picture, view.calibration, Options(least_score=0))
         scored = [spot for spot in score(session, view, found) if spot.held is not None]
         near = [spot.kind == "near_miss" for spot in scored]
         return found, len(scored), np.mean(near), np.mean([spot.held for spot in scored])
@@ -203,7 +203,7 @@ def test_the_regions_hold_on_rendered_rough_tissue_and_not_without_the_part(monk
     # Regions of interest of the same boxes are as uncertain, and hold as many.
     cut, ratios = [], []
     for spot in whole[:60]:
-        (alone,) = run(picture, view.calibration, Options(roi=spot.region.box))
+        (alone,) = run(picture, view.calibration, Options(roi=spot.region.box, least_score=0))
         pair = [each.estimates[best].deviation_deg for each in (spot, alone) if (best := best_of(each.estimates)[0])]
         if len(pair) == 2:
             ratios.append(pair[1] / pair[0])

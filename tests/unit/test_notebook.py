@@ -61,7 +61,7 @@ def test_no_record_has_a_long_text(records):
 
 def test_texts_tell_what_matters(found):
     spot = found[0]
-    assert repr(found).startswith("<Specularities: 1 specularity, 1 with a normal; encoding linear")
+    assert repr(found).startswith("<Specularities: 1 specularity, 1 with a best normal; encoding linear")
     assert "normals: circle_pose" in repr(spot)
     estimate = spot.estimates["cone_axis"]
     assert f"{estimate.deviation_deg:.3g}" in repr(estimate)

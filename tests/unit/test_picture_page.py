@@ -36,10 +36,10 @@ def estimate(look, degrees=2.0, **more):
     )
 
 
-def highlight(kind, at, score=0.2):
+def highlight(kind, at):
     edge = np.array(RING) + at
     region = Region((at[0] - 5, at[1] - 5, 10, 10), np.array(at), 0.5)
-    return Highlight(region, kind, score, 9, None, None, None, 1.0, 0.0, edge, np.array([at]), 0.0)
+    return Highlight(region, kind, 9, None, None, None, 1.0, 0.0, edge, np.array([at]), 0.0)
 
 
 def spot(i, at, estimates, best, drawings=None):
@@ -47,7 +47,7 @@ def spot(i, at, estimates, best, drawings=None):
     corner = (int(at[0]) - 5, int(at[1]) - 5)
     patch = Patch(np.zeros((10, 10)), corner, np.array(at, float), 1.0, (5, 5))
     region = Region((*corner, 10, 10), (corner[0] + 5, corner[1] + 5), None)
-    made = Specularity(region, patch, estimates, highlight(Kind.ISOLATED, at, 0.5), id=i)
+    made = Specularity(region, patch, estimates, highlight(Kind.ISOLATED, at), id=i)
     return given(made, best, drawings or {name: Drawing([], []) for name in estimates})
 
 
@@ -93,7 +93,7 @@ def test_budget_tilt_and_flags_stand_in_the_data(tmp_path):
     assert row["parts"] == pytest.approx({"noise": 1.0, "camera": np.sqrt(3.0)}, abs=1e-3)
     assert failed == {"name": "circle_pose", "status": "streak", "detail": "long"}
     assert data["words"]["flags"][row["flags"][0]] == "the isophotes enclose clipped pixels"
-    assert "3 of 3 highlights have a normal" in text
+    assert "3 of 3 highlights have a best normal" in text
     assert "± 2° (median), mostly of camera (1.7°) and noise (1°)" in text
 
 
@@ -184,14 +184,14 @@ def test_counts_and_the_light_are_told_alike_on_page_and_terminal(tmp_path):
     record = record_of(spots, others, assumed)
     write_picture_page(tmp_path / "index.html", record, np.full((HEIGHT, WIDTH, 3), 0.3, np.float32))
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
-    assert "2 of 3 highlights have a normal" in page
+    assert "2 of 3 highlights have a best normal" in page
     assert "3 more were found and left out" in page
     assert "(2 border, 1 few pixels)" in page
     assert LIGHT_AT_CAMERA in page
     lines = [*assumed_lines(record.choices.assumed), *count_lines(record, Path("frame.png"))]
     said = "\n".join(lines)
     assert lines[0] == f"note: {LIGHT_AT_CAMERA}"
-    assert "3 specularities found in frame.png, 2 with a normal" in lines
+    assert "3 specularities found in frame.png, 2 with a best normal" in lines
     assert "3 more highlights found and left out" in said
     assert "2 border, 1 few pixels" in said
     # Where the light is told, or all have a normal, there is nothing to say.

@@ -294,7 +294,10 @@ def test_each_frame_counts_once_and_coverage_is_over_those_that_report():
     twins = Matcher(bank).find(spot(features))
     assert twins.rms_deg == pytest.approx(math.sqrt((1 + 9) / 2))
     assert twins.base_rms_deg == pytest.approx(2 * twins.rms_deg)
-    assert twins.coverage == 1.0
+    assert (twins.coverage, twins.wrong_and_sure) == (1.0, 0.0)
+    bank.append((0, replace(bank[0][1], is_wrong=True)))
+    assert Matcher(bank).find(spot(features)).wrong_and_sure == pytest.approx(0.5)
+    assert Matcher(bank[1:5]).find(spot(features)).wrong_and_sure is None
 
 
 def test_the_interval_covers():

@@ -27,7 +27,7 @@ from simtest.validation.realisation import realise
 from simtest.validation.run_summary import MOST_TEXTS, faults_of
 from simtest.validation.runner import run_experiment
 from simtest.validation.scoring import mahalanobis2, match, rows
-from simtest.validation.statistics import figures, summarise
+from simtest.validation.statistics import figures, is_wrong_and_sure, summarise
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 
@@ -227,6 +227,24 @@ def test_median_and_coverage_of_skewed_errors():
     assert (found.median_deg, found.mean_deg) == (2.0, 4.0)
     # 4.5 lies between the quantiles of one degree of freedom and of two, 3.84 and 5.99.
     assert found.coverage95 == pytest.approx(2 / 3)
+
+
+def test_wrong_and_sure_is_above_5_deg_and_above_three_deviations():
+    # An error with its deviation, both in deg; of the last nobody states one, which counts nowhere.
+    lines = [(4.9, 0.1), (5.1, 1.6), (5.1, 1.8), (30.0, 9.9), (30.0, 10.1), (80.0, None)]
+    wrong = [False, True, False, True, False, False]
+    assert is_wrong_and_sure(*zip(*lines, strict=True)).tolist() == wrong
+    made = []
+    for number, (error, deviation) in enumerate(lines):
+        row = dict(setting="s", estimator="a", true_id=number, status="ok", error_deg=error)
+        if deviation is not None:
+            # A third of the variance along one axis, so that the trace alone has the deviation.
+            variance = np.radians(deviation) ** 2
+            row |= dict(cov_11=variance / 3, cov_12=0.0, cov_22=variance * 2 / 3)
+        made.append(row)
+    (found,) = summarise(table(made, {}))["s"].values()
+    assert found.wrong_and_sure == pytest.approx(2 / 5)
+    assert summarise(hand_made())["s1"]["b"].wrong_and_sure is None
 
 
 def test_summary_where_nothing_answered():

@@ -92,7 +92,15 @@ class TwinResult:
     @property
     def coverage(self) -> float | None:
         """Mean share of the twins' stated 95 % regions that hold the truth."""
-        told = [each.twins.coverage for each in self.spots if each.twins.coverage is not None]
+        return self._mean("coverage")
+
+    @property
+    def wrong_and_sure(self) -> float | None:
+        """Mean share of the twins that are wrong and sure."""
+        return self._mean("wrong_and_sure")
+
+    def _mean(self, share: str) -> float | None:
+        told = [value for each in self.spots if (value := getattr(each.twins, share)) is not None]
         return float(np.mean(told)) if told else None
 
 
@@ -171,8 +179,9 @@ FILES = ("twin.json", "twin.csv", "index.html")
 
 COLUMNS = (
     "specularity", "x_px", "y_px", "radius_px", "estimator", "stated_deg", "twin_rms_deg", "twin_low_deg",
-    "twin_high_deg", "twin_p95_deg", "coverage", "near_misses", "false", "glint_rms_deg", "near_rms_deg",
-    "base_rms_deg", "base_low_deg", "base_high_deg", "near_mm", "median_mm", "far_mm", "twins", "unlikeness", "covered",
+    "twin_high_deg", "twin_p95_deg", "coverage", "wrong_and_sure", "near_misses", "false", "glint_rms_deg",
+    "near_rms_deg", "base_rms_deg", "base_low_deg", "base_high_deg", "near_mm", "median_mm", "far_mm", "twins",
+    "unlikeness", "covered",
 )  # fmt: skip
 
 
@@ -208,6 +217,7 @@ def to_json(result: TwinResult, command: str = "") -> JsonObject:
         "twin_rms_deg": result.rms_deg(),
         "twin_base_rms_deg": result.rms_deg("base_rms_deg"),
         "coverage": result.coverage,
+        "wrong_and_sure": result.wrong_and_sure,
         "twin_distance_mm": [_finite(each) for each in result.distance_mm],
         "specularities": [_spot_json(each) for each in result.spots],
         "provenance": provenance.environment(),
@@ -241,7 +251,7 @@ def _row(each: SpotTwins) -> tuple[object, ...]:
     x, y = spot.peak_px.tolist()
     return (
         spot.index, round(x, 3), round(y, 3), spot.radius_px, spot.estimator, each.stated_deg, twins.rms_deg,
-        *twins.interval_deg, twins.p95_deg, twins.coverage, twins.near_misses, twins.false,
+        *twins.interval_deg, twins.p95_deg, twins.coverage, twins.wrong_and_sure, twins.near_misses, twins.false,
         _finite(twins.glint_rms_deg), _finite(twins.near_rms_deg), twins.base_rms_deg, *twins.base_interval_deg,
         *(_finite(each) for each in twins.distance_mm), twins.effective, twins.unlikeness, int(twins.is_covered),
     )  # fmt: skip

@@ -25,6 +25,7 @@ from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.statistics import mean_interval, weighted_quantile
 from simtest.simulation.frame import RenderedView
 from simtest.validation.scoring import mahalanobis2, match, on_instruments, peak_px
+from simtest.validation.statistics import is_wrong_and_sure
 
 NEIGHBOUR = 3
 """How crowded the surroundings are: the distance to this neighbour."""
@@ -73,6 +74,7 @@ class ScoredSpot:
     base_error_deg: float  # to the base's normal at the same point
     held: bool | None  # whether the stated 95 % region holds the normal; None where nothing is stated
     distance_mm: float = math.nan  # of the surface along the sightline; NaN where that meets none
+    is_wrong: bool = False  # whether it is wrong and sure of what it states
 
 
 FEATURES = (
@@ -131,11 +133,13 @@ def score(session: Session, view: RenderedView, specularities: Specularities) ->
         else:
             continue
         estimate = spot.estimate
-        squared = mahalanobis2(estimate, fine if estimate.target == "fine" else base)
+        stated = fine if estimate.target == "fine" else base
+        squared = mahalanobis2(estimate, stated)
+        wrong = bool(is_wrong_and_sure(angle_deg(estimate.normal, stated), estimate.deviation_deg))
         held = None if squared is None else bool(squared <= chi_squared.quantile(0.95, 2))
         kind: SpotKind = "glint" if i in matched else "near_miss" if shown[i] else "false"
         to_fine, to_base = (float(angle_deg(estimate.normal, normal)) for normal in (fine, base))
-        scored.append(ScoredSpot(spot, kind, to_fine, to_base, held, float(at_look.distance[i])))
+        scored.append(ScoredSpot(spot, kind, to_fine, to_base, held, float(at_look.distance[i]), wrong))
     return scored
 
 
@@ -215,6 +219,7 @@ class Twins:
     interval_deg: tuple[float, float]  # its 95 % interval over the bank's frames
     p95_deg: float  # 95 % of the errors against the fine normal lie below
     coverage: float | None  # share whose stated 95 % region holds the truth; None where none states one
+    wrong_and_sure: float | None  # share of the same
     near_misses: float  # share of near misses
     false: float  # share of false detections among all
     glint_rms_deg: float  # of the twins that are glints; NaN where there are none
@@ -251,6 +256,7 @@ class Matcher:
         self._real = np.array([spot.kind != "false" for _, spot in spots])
         self._stated = np.array([each is not None for each in held])
         self._held = np.array([bool(each) for each in held])
+        self._wrong = np.array([spot.is_wrong for _, spot in spots])
 
     def find(self, spot: Spot) -> Twins:
         """Measure the twins of a highlight."""
@@ -260,13 +266,15 @@ class Matcher:
         weights = _weights(np.where(self._real, squared, np.inf), self._shares, TWINS)
         near, glint = weights * self._near, weights * ~self._near
         stated = weights * self._stated
+        share = stated / stated.sum() if stated.sum() > 0 else None
         at = partial(weighted_quantile, self._distances, weights)
         return Twins(
             rms_deg=_rms(weights, self._errors),
             interval_deg=self._interval(weights, self._errors),
             base_rms_deg=_rms(weights, self._base_errors),
             base_interval_deg=self._interval(weights, self._base_errors),
-            coverage=float(stated @ self._held / stated.sum()) if stated.sum() > 0 else None,
+            coverage=None if share is None else float(share @ self._held),
+            wrong_and_sure=None if share is None else float(share @ self._wrong),
             near_misses=float(near.sum() / weights.sum()),
             false=float(whole @ ~self._real / whole.sum()),
             glint_rms_deg=_rms(glint, self._errors),
