@@ -20,6 +20,7 @@ from simtest.errors import Failure
 from simtest.geometry import Array, FittedConic, Image, Mask, fit_ellipses
 from simtest.geometry.level_sets import LevelSet, crossings, level_set_around
 from simtest.geometry.patch import dilated
+from simtest.runtime.fitted import fitted_number
 
 SHAPE_PX = 0.7
 """Smoothing of the specular light before the shape of highlights is measured."""
@@ -89,6 +90,10 @@ FOOT_REACH, FARTHEST_PX = 0.7, 10
 REACH_PX = 3
 """So near to a spot a border may cut it, and light is no surroundings of it."""
 
+EDGE_STEP = fitted_number("fold_edge.step")
+EDGE_NEAR, EDGE_SECTORS = 0.4, 8
+"""The ring around a spot in which an edge shows begins this share of a radius from it, and has so many sectors."""
+
 _Contour = tuple[Array, FittedConic]
 """An isophote's points and its ellipse."""
 
@@ -142,7 +147,12 @@ def classify(spots: list[SpecularSpot], picture: ColourPicture, bright: Mask) ->
             spot, box, sets[0], *_shape(fits), at_border, clipped, white, *_around(spot, box, picture, bright)
         )
         kind = _kind(one)
-        judged.append(None if _is_pale(one, kind, max(smoothed.shape)) else _highlight(one, kind))
+        if _is_pale(one, kind, max(smoothed.shape)):
+            judged.append(None)
+            continue
+        if kind in SINGLE and edge_step(spot, picture, bright) > EDGE_STEP:
+            kind = Kind.BORDER
+        judged.append(_highlight(one, kind))
     return judged
 
 
@@ -259,6 +269,30 @@ def _at_border(spot: SpecularSpot, picture: ColourPicture) -> bool:
     spot_mask = np.zeros(outside.shape, dtype=bool)
     spot_mask[y - top : y - top + height, x - left : x - left + width] = spot.mask
     return bool(dilated(spot_mask, REACH_PX)[outside].any())
+
+
+def edge_step(spot: SpecularSpot, picture: ColourPicture, bright: Mask) -> float:
+    """Return the largest step of all light between opposite sectors of the ring around a spot, over the spot's light.
+
+    A highlight's light stands on that of the tissue under it. Where that ends, at the edge of a fold before a dark
+    background or of a shadow, sharpening, coding and mixed pixels leave light that the tissue's colour does not
+    explain: a small part of the step beside it.
+    """
+    (x, y), (height, width), radius = spot.corner, spot.mask.shape, np.sqrt(spot.area_px / np.pi)
+    near, far = max(int(EDGE_NEAR * radius), 1), max(int(FOOT_REACH * radius), REACH_PX) + 2
+    left, top = max(x - far, 0), max(y - far, 0)
+    crop = np.s_[top : y + height + far, left : x + width + far]
+    own = np.zeros(picture.inside[crop].shape, dtype=bool)
+    own[y - top : y - top + height, x - left : x - left + width] = spot.mask
+    ring = dilated(own, far) & ~dilated(own, near) & picture.inside[crop] & ~dilated(bright[crop] & ~own, REACH_PX)
+    rows, columns = np.nonzero(ring)
+    middle = np.argwhere(own).mean(axis=0)
+    turns = np.arctan2(rows - middle[0], columns - middle[1]) / (2 * np.pi)
+    sector = np.floor(EDGE_SECTORS * turns).astype(np.intp) % EDGE_SECTORS
+    count = np.bincount(sector, minlength=EDGE_SECTORS)
+    light = np.bincount(sector, mean_channel(picture.linear[crop])[ring], EDGE_SECTORS) / np.maximum(count, 1)
+    both = (count > 0) & (np.roll(count, EDGE_SECTORS // 2) > 0)
+    return float(np.abs(light - np.roll(light, EDGE_SECTORS // 2)).max(where=both, initial=0.0)) / spot.value
 
 
 def _shape(fits: list[_Contour]) -> tuple[float | None, float | None, float | None]:

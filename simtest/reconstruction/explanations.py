@@ -45,7 +45,7 @@ KINDS = {
     "cluster": "several highlights that touch; they carry no single normal",
     "elongated": "a streak, as on an instrument or a fold",
     "merged": "two highlights grown together",
-    "border": "cut by the border of the view",
+    "border": "cut by the border of the view, or at an edge whose step of light outshines it",
     "inter_reflection": "coloured light: reflected by tissue before",
     "unclear": "its shape or its surroundings are not those of a highlight",
 }

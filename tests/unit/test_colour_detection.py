@@ -4,7 +4,7 @@ import pytest
 
 from simtest.calibration import Calibration, Frame, NoiseModel, srgb_decode, srgb_encode
 from simtest.detection import colour as colour_detection
-from simtest.detection.classify import _around, _isophotes
+from simtest.detection.classify import _around, _isophotes, edge_step
 from simtest.detection.detector import Kind
 from simtest.detection.spots import ColourPicture, SpecularSpot, SplitLight, split_light
 from simtest.detection.view import find_view
@@ -98,6 +98,33 @@ def test_a_pale_edge_is_no_highlight(from_edge, size, expected):
     bare = np.ones(total.shape, dtype=bool)
     bare[crop] = False
     assert colour_detection._stands_out(spot, total, bare) is expected
+
+
+@pytest.mark.parametrize(
+    ("from_edge", "peak", "expected"), [(5, 0.06, Kind.BORDER), (5, 0.4, Kind.ISOLATED), (60, 0.06, Kind.ISOLATED)]
+)
+def test_a_spot_beside_a_larger_step_of_light_is_at_an_edge(from_edge, peak, expected):
+    """At a fold's edge before the dark, light that the tissue's colour leaves over is a small part of the step."""
+    x, _ = places()
+    linear = np.where(x < 160, 0.4, 0.0)[..., None] * TISSUE + lobe(160 - from_edge, 120, 2.0, peak=peak)[..., None]
+    linear = cv2.GaussianBlur(linear, (0, 0), 0.7) + np.random.default_rng(3).normal(0, 0.001, linear.shape)
+    encoded = np.rint(255 * srgb_encode(np.clip(linear, 0, 1))) / 255
+    found = detect_in_picture(encoded.astype(np.float32)).detection.highlights
+    (spot,) = [each for each in found if abs(each.region.peak[1] - 120) < 3]
+    assert spot.kind is expected
+
+
+def test_light_of_another_highlight_is_no_edge():
+    total = np.full((40, 60, 1), 0.2, dtype=np.float32) * np.ones(3, dtype=np.float32)
+    bright = np.zeros(total.shape[:2], dtype=bool)
+    bright[18:23, 28:31] = bright[16:25, 34:38] = True
+    total[16:25, 34:38] = 0.9
+    nothing = np.zeros_like(bright)
+    picture_ = ColourPicture(total, SplitLight(total[..., 0], total[..., 0], 0.0), nothing, nothing, nothing, None)
+    spot = SpecularSpot(np.array([[29, 20]]), 0.1, (28, 18), bright[18:23, 28:31], False, False)
+    assert edge_step(spot, picture_, bright) < 0.1
+    total[:, 31:] = 0.0
+    assert edge_step(spot, picture_, bright & (np.arange(60) < 31)) == pytest.approx(2.0, abs=0.01)
 
 
 def test_a_dark_background_is_no_texture():
