@@ -135,11 +135,11 @@ def rows_of(kind: str, session: Session, shown: Image, calibrations: Sequence[tu
     """Return a picture's answers, before and after."""
     rows: list[Row] = []
     for name, calibration in calibrations:
-        after = reconstruct(shown, calibration)
+        after = reconstruct(shown, calibration, least_score=0.0)
         before = after
         if any(each.kind is Kind.BORDER for each in after.detection.others):
             with replaced.object(classify, "EDGE_STEP", math.inf):
-                before = reconstruct(shown, calibration)
+                before = reconstruct(shown, calibration, least_score=0.0)
         if not len(before):
             return rows
         kept = answers(after, session)

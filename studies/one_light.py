@@ -246,7 +246,7 @@ def _rows(session: Session, view: RenderedView, number: int, family: int) -> lis
     return [
         *base,
         *_told_rows(session, view, picture, by_range, {**about, "told": "range"}),
-        *_told_rows(session, view, picture, _with_distance(by_range, view), {**about, "told": "distance"}),
+        *_told_rows(session, view, picture, with_distance(by_range, view), {**about, "told": "distance"}),
     ]
 
 
@@ -365,7 +365,7 @@ def _numbers(spot: ScoredSpot, before: ScoredSpot | None) -> Row:
     }  # fmt: skip
 
 
-def _with_distance(calibration: Calibration, view: RenderedView) -> Calibration:
+def with_distance(calibration: Calibration, view: RenderedView) -> Calibration:
     """Return a calibration that states the distance of the middle highlight, with a normal error."""
     true = float(np.median([point.distance for point in view.highlights if point.lit] or [30.0]))
     off = 1 + DISTANCE_SD * from_integer(view.scene.sensor.seed).standard_normal()

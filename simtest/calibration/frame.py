@@ -254,8 +254,15 @@ class Frame:
     def patch(self, box: Box, peak: tuple[int, int] | None = None) -> Patch | Failure:
         """Cut a region of interest out (see `Patch.cut`); the same box and peak give the same patch again."""
         if (box, peak) not in self._patches:
-            self._patches[box, peak] = Patch.cut(
+            cut = Patch.cut(
                 self.smoothed, box, peak, saturated=self.corrected.saturated, seen=self.seen,
                 raw=self.corrected.intensity, noise=self.noise_as_smoothed, smoothing_px=self.smoothing_px,
             )  # fmt: skip
+            if self.light is not None and isinstance(cut, Patch):
+                x, y, width, height = box
+                crop, gain = np.s_[y : y + height, x : x + width], self.corrected.gain
+                left = self.channels[crop].reshape(height, width, -1).max(axis=2) - self.light[crop]
+                left = left if gain is None else left * gain[crop]
+                cut = replace(cut, diffuse=max(float(median(left.ravel())), 0.0))
+            self._patches[box, peak] = cut
         return self._patches[box, peak]

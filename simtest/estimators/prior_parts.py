@@ -15,7 +15,7 @@ from simtest.calibration import CameraPrior, Distribution, Normal, Priors
 from simtest.calibration.priors import AT_CAMERA_MM
 from simtest.estimators.budget import equivalent_covariance
 from simtest.estimators.protocol import Estimate
-from simtest.estimators.small_spots import HighlightAxis
+from simtest.estimators.small_spots import GAUSSIAN_RADIUS2, HighlightAxis, smoothed_radius
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.lenses import undistort_with_errors
 from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
@@ -88,12 +88,12 @@ def _moves(angle: float, lights: Array, distance: Array) -> Array:
 CROWD = 3
 """A frame with more highlights than this for each light shows relief or folds: a smooth patch shows one for each."""
 
-AROUND = 12  # the brightest of so many nearest highlights stands for a highlight point's radiance
+WIDEST = np.radians(fitted_number("near_misses.widest")) ** 2
+SPREAD_PX, NARROWER = fitted_number("near_misses.spread"), fitted_number("near_misses.narrower")
 
-BRIGHT = np.radians(fitted_number("near_misses.bright")) ** 2
-FAINT = np.radians(fitted_number("near_misses.faint")) ** 2
-USUAL, MOST = fitted_number("near_misses.usual"), fitted_number("near_misses.most")
-RARER = fitted_number("near_misses.rarer")
+LEAST_RADIUS_PX, DARK = 0.5, 0.1
+"""Of a spot before smoothing; and least diffuse light over the frame's brightest highlight that tells a lobe's width:
+bodies are not darker, but frames of the specular light alone are."""
 
 APART = 3  # lights of a larger number are a ring, whose highlights melt: it counts as so many
 
@@ -102,43 +102,40 @@ SEVERAL = 0.5
 as large as the part of the budget that stands for it, or smaller, never several times larger: the sum of both parts
 would hold 99 % and more."""
 
-UNTOLD_FAINTNESS = 1.0
-"""ln(I0 / I) where the patch does not know how bright the others are; two thirds of the spots have less."""
-
 
 def near_miss_variance(patch: Patch, lights: int) -> float:
     """Return the variance of a highlight's normal along each axis by the chance that it is a near miss, rad^2.
 
     Where a surface is rough or folded, a bright spot need not hold a point at which the normal bisects the directions
     to light and camera: a minimum of the misfit tau above 0 shines too (theory.md 7.1b). Such a near miss looks like
-    any other spot, and the estimate is off by abs(tau) in an unknown direction. What the frame tells is its brightness:
-    a Gaussian lobe of standard deviation s gives a near miss the radiance I0 exp(-abs(tau)^2 / (2 s^2)), with I0 that
-    of a highlight point at the same place. So
+    any other spot, and the estimate is off by abs(tau) in an unknown direction. What the picture tells is its
+    contrast c to the body's diffuse light: with a Gaussian lobe of standard deviation s it is c0 exp(-tau^2 / (2 s^2)),
+    and since a wide lobe spreads the same light over a larger angle, c0 = E / s^2. The miss
 
-        abs(tau)^2 = 2 s^2 ln(I0 / I).
+        tau^2 = 2 s^2 ln(E / (s^2 c))
 
-    The brightest of the spots around stands for I0. Smaller spots are also dimmed by the point spread, and clipped ones
-    are brighter than they look; both are part of what was fitted.
+    that a spot of contrast c can hide grows with the lobe's width until that dims the lobe's own peak to c. Whatever
+    the width, it is at most 2 E / (e c), so that the variance goes with 1 / c. Of a clipped highlight c is the least; a
+    frame most of whose highlights are clipped has a lobe that is narrower still.
 
     `patch`: the highlight, with the frame's other ones; `lights`: how many lights there are, at least 1. Returns 0 in a
-    frame that does not show more than `CROWD` highlights for each light; where the patch does not know the frame's
-    others, that of the usual number.
+    frame that does not show more than `CROWD` highlights for each light.
     """
-    count = USUAL if patch.others_px is None else (len(patch.others_px) + 1) / min(lights, APART)
-    if count <= CROWD:
+    if patch.others_px is not None and len(patch.others_px) + 1 <= CROWD * min(lights, APART):
         return 0.0
-    scale = (USUAL / min(count, MOST)) ** RARER * (SEVERAL if 1 < lights <= APART else 1.0)
-    return float(scale * (BRIGHT + FAINT * _faintness(patch)))
+    scale = (SEVERAL if 1 < lights <= APART else 1.0) * (1 - NARROWER * patch.clipped_share)
+    return float(scale * WIDEST / _contrast(patch))
 
 
-def _faintness(patch: Patch) -> float:
-    """Return ln(I0 / I) of a highlight, 0 for one that is brighter than those around."""
-    values = np.array(patch.others_value)
-    if len(values) == 0 or len(values) != len(patch.neighbours_px):
-        return UNTOLD_FAINTNESS
-    away = np.sum((patch.neighbours_px - patch.peak_px) ** 2, axis=1)
-    brightest = float(values[np.argsort(away, kind="stable")[:AROUND]].max())
-    return max(float(np.log(brightest / patch.peak_value)), 0.0) if brightest > 0 else 0.0
+def _contrast(patch: Patch) -> float:
+    """Return a highlight's height over the diffuse light beside it, before point spread and smoothing.
+
+    Both dim a spot of few pixels.
+    """
+    radius, base = smoothed_radius(patch) or (math.inf, 0.0)
+    size2 = max(radius**2 - GAUSSIAN_RADIUS2 * patch.smoothing_px**2, LEAST_RADIUS_PX**2)
+    diffuse = max(patch.diffuse + base * patch.peak_value, DARK * max(*patch.others_value, patch.peak_value, 0.0))
+    return (1 - base) * patch.peak_value / diffuse * (1 + SPREAD_PX**2 / size2)
 
 
 NEAR_SHARE = 0.05

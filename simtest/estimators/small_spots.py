@@ -243,13 +243,13 @@ def radius_before_smoothing_px(patch: Patch) -> float | None:
     That of the circle with the area that the smoothed spot has at half its height above the surroundings, less what
     smoothing adds to a Gaussian's.
     """
-    found = _smoothed_radius(patch)
+    found = smoothed_radius(patch)
     if found is None:
         return None
     return math.sqrt(max(found[0] ** 2 - GAUSSIAN_RADIUS2 * patch.smoothing_px**2, 0.0))
 
 
-def _smoothed_radius(patch: Patch) -> tuple[float, float] | None:
+def smoothed_radius(patch: Patch) -> tuple[float, float] | None:
     """Return the radius of the smoothed spot at half height, px, and the level of its surroundings over the peak."""
     values = patch.values if patch.seen is None else patch.values[patch.seen]
     # the value of that rank, without the sorting and interpolation of a percentile
@@ -270,7 +270,7 @@ def fit_small_spots(patches: Sequence[Patch], camera: Camera) -> list[SmallSpot]
     if not patches:
         return []
     # the pixels around each peak
-    shapes = [_smoothed_radius(patch) or (RESOLVED_PX, 0.0) for patch in patches]
+    shapes = [smoothed_radius(patch) or (RESOLVED_PX, 0.0) for patch in patches]
     reaches = [WINDOW_RADII * radius + WINDOW_PX for radius, _ in shapes]
     # All windows are as large as that of the largest small spot, so that no spot's last bits depend on the others.
     widest = max(math.sqrt(RESOLVED_PX**2 + GAUSSIAN_RADIUS2 * patch.smoothing_px**2) for patch in patches)

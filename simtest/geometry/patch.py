@@ -75,6 +75,11 @@ class Patch:
         Peaks of the frame's other specularities, px; None: not known, empty: there are none.
     others_value : tuple of float
         Smoothed intensities of those, 0 where one has no patch; empty: not known.
+    diffuse : float
+        The body's light beside the highlight that is not in `values`: that of its strongest channel, where these are
+        the specular part of a colour frame.
+    clipped_share : float
+        Share of the frame's highlights that are clipped.
     found : optional
         The level sets found so far: those of the patch that this one is a copy of, where it has the same.
     kept : dict
@@ -102,6 +107,8 @@ class Patch:
     smoothing_px: float = 0.0
     others_px: tuple[tuple[float, float], ...] | None = None
     others_value: tuple[float, ...] = ()
+    diffuse: float = 0.0
+    clipped_share: float = 0.0
     found: _LevelSets | None = field(default=None, compare=False, repr=False)
     kept: dict[Hashable, tuple[object, object]] = field(default_factory=dict, init=False, compare=False, repr=False)
 

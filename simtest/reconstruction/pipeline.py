@@ -18,6 +18,7 @@ from simtest.detection.view import View, find_view
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import prepare, run_in_frame
+from simtest.estimators.family import MIN_CLIPPED_PX
 from simtest.estimators.prior_parts import relief_part, to_base
 from simtest.estimators.protocol import Target
 from simtest.estimators.small_spots import UNRESOLVED
@@ -265,12 +266,17 @@ def _estimate(
         if highlight is not None and highlight.kind is Kind.CLUSTER:
             cut[i] = Failure(Reason.CLUSTER, f"{len(highlight.peaks)} highlights touch, and carry no single normal")
     values = [0.0 if isinstance(patch, Failure) else patch.peak_value for patch in cut]
+    masks = [patch.saturated for patch in cut if not isinstance(patch, Failure)]
+    clipped = sum(mask is not None and np.count_nonzero(mask) >= MIN_CLIPPED_PX for mask in masks) / max(len(masks), 1)
     patches = [
         patch
         if isinstance(patch, Failure)
-        else replace(patch, others_px=(*peaks[:i], *peaks[i + 1 :]), others_value=(*values[:i], *values[i + 1 :]))
+        else replace(
+            patch, others_px=(*peaks[:i], *peaks[i + 1 :]), others_value=(*values[:i], *values[i + 1 :]),
+            clipped_share=clipped,
+        )
         for i, patch in enumerate(cut[: len(regions)])
-    ]
+    ]  # fmt: skip
     camera, priors = frame.calibration.camera, frame.calibration.priors
     prepare(list(estimators.values()), patches, camera)
     relief = relief_part(priors)

@@ -388,6 +388,8 @@ def patch_request(patch: Patch, camera: Camera, priors: Priors, hello: Hello) ->
         "noise": None if isinstance(patch.noise, np.ndarray) or patch.noise is None else float(patch.noise),
         "others_px": None if patch.others_px is None else [list(other) for other in patch.others_px],
         "others_value": [float(value) for value in patch.others_value],
+        "diffuse": float(patch.diffuse),
+        "clipped_share": float(patch.clipped_share),
     }
     return _header("patch", camera, priors, about, missing), arrays
 
