@@ -114,7 +114,9 @@ def test_every_command_and_option_is_in_the_reference():
 
 def test_names_of_what_is_shipped_are_in_the_reference():
     page = shipped_page()
-    shipped = [*ROOT.glob("scenes/*.toml"), *ROOT.glob("scenes/*/*.toml")]
+    # Foolers are scenes of a study, taken by their path.
+    files = [*ROOT.glob("scenes/*.toml"), *ROOT.glob("scenes/*/*.toml")]
+    shipped = [path for path in files if path.parent.name != "foolers"]
     assert len(shipped) > 30
     points = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"]
     estimators = points["simtest.estimators"]
