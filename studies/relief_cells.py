@@ -37,7 +37,7 @@ SLOPES_DEG, ALPHAS = (2.0, 4.0, 6.0), (0.03, 0.1, 0.2)
 PER_CELL, MOST_FRAMES = 1000, 12
 
 SEED = 58
-"""Of the frames; nothing was tuned on them."""
+"""Of the frames; of the numbers `narrower` alone was changed, from 0.8 to 0.7, after they were seen."""
 
 AIMED_AT = (0.92, 0.98)
 """Share of the 95 % regions of each cell that must contain the truth."""
