@@ -25,7 +25,12 @@ NAMES = ("uneven", "ground", "bright", "flat", "clipped")
 """Of what a score is made of, in the order of `features`; fitted.toml says what each is."""
 
 BIAS, LEAST_SCORE = fitted_number("score.bias"), fitted_number("score.least")
-WEIGHTS = np.array([fitted_number(f"score.{name}") for name in NAMES])
+WEIGHTS = np.array(
+    [
+        fitted_number("score.uneven"), fitted_number("score.ground"), fitted_number("score.bright"),
+        fitted_number("score.flat"), fitted_number("score.clipped"),
+    ]
+)  # fmt: skip
 
 MOST_SIDE = 40
 """Of a larger patch every n-th pixel is looked at, so that about so many remain along its longer side."""
