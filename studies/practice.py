@@ -10,6 +10,7 @@ import math
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -54,8 +55,11 @@ def main(arguments: Sequence[str]) -> None:
         of_view = calibration_of_view(
             2 * math.degrees(math.atan(camera.width / (2 * camera.fx))), camera.width, camera.height, "width"
         )
-        by_view.append(score(session, view, run(picture, of_view, Options(least_score=0))))
-        by_calibration.append(score(session, view, run(picture, told(view, family), Options(least_score=0))))
+        by_view.append(score(session, view, run(picture, of_view, Options())))
+        calibrated = told(view, family)
+        # as of a picture: with floors
+        calibrated = replace(calibrated, priors=replace(calibrated.priors, floors=None))
+        by_calibration.append(score(session, view, run(picture, calibrated, Options())))
         print(f"frame {number}: {len(by_view[-1])} highlights", file=sys.stderr, flush=True)
     print_markdown([
         ["given", "best", "frames", "highlights", "median, deg", "95th percentile", "region, median", "inside"],
