@@ -65,8 +65,11 @@ Row = dict[str, Any]
 
 ROOT = Path(__file__).parents[1]
 TRAINED = ("albedo", "convex", "creases", "fold_edges")
-TESTED = {"broad_lobe": 350, "outlines": 350, "inter_reflection": 150, "concave": 150}
+TESTED = {"broad_lobe": 350, "outlines": 350, "concave": 150}
 """The kinds that the score was not fitted to, with how many false detections of each are looked at."""
+
+SLOW = ("inter_reflection",)
+"""Not in the table: its false detections are too rare for the time that its frames take."""
 SEED, TRAINED_SEED = 700, 601
 MOST_FRAMES = 800  # of a kind
 SIZE, FOV_DEG = (400, 300), 30.0
@@ -489,7 +492,7 @@ def report(made: dict[str, list[Row]]) -> None:
     """Print the table of each kind, and that of other thresholds."""
     foolers = [row for kind in TESTED for row in made[kind]]
     heads = ["answered, no score", "wrong and sure", "answered", "wrong and sure", "true ones refused"]
-    lines = [summary(name, made.get(name, foolers)) for name in (*TESTED, "all four", "smooth", "tissue")]
+    lines = [summary(name, made.get(name, foolers)) for name in (*TESTED, "all three", "smooth", "tissue")]
     print_markdown([["kind", "true", "false", "AUC", *heads, "false ones kept"], *lines])
     table = [["least score", *heads[2:], "false ones kept", "true ones refused, smooth", "true ones refused, tissue"]]
     for least in THRESHOLDS:
