@@ -9,7 +9,7 @@ import pytest
 from simtest.geometry import Patch, smooth
 from simtest.reconstruction.scores import LEAST_SCORE
 from simtest.spec import load_scene
-from studies.foolers import TESTED, TRAINED, Detected, auc, is_highlight, summary
+from studies.foolers import SLOW, TESTED, TRAINED, Detected, auc, is_highlight, summary
 
 SCENES = Path(__file__).parents[2] / "scenes" / "foolers"
 Y, X = np.mgrid[:80, :80] + 0.5 - 40
@@ -20,11 +20,11 @@ def dome(width):
 
 
 def test_each_kind_is_a_scene_and_no_kind_is_both_trained_and_tested():
-    assert {path.stem for path in SCENES.glob("*.toml")} == {*TRAINED, *TESTED}
+    assert {path.stem for path in SCENES.glob("*.toml")} == {*TRAINED, *TESTED, *SLOW}
     assert not {*TRAINED} & {*TESTED}
 
 
-@pytest.mark.parametrize("kind", [*TRAINED, *TESTED])
+@pytest.mark.parametrize("kind", [*TRAINED, *TESTED, *SLOW])
 def test_a_scene_is_sound(kind):
     assert load_scene(SCENES / f"{kind}.toml").camera.width > 0
 
