@@ -272,7 +272,7 @@ def detections(kind: str, number: int, seed: int, session: Session | None) -> tu
     priors = Priors((scene.rig.lights[0].nominal_mm,), distance, falloff_power=None, floors=OF_PICTURES)
     calibration = Calibration(scene.camera.model(), priors=priors)
     detector = "peaks" if grey or number % 4 == 1 else "colour"
-    found = reconstruct(shown, calibration, ["bisector"], detector=detector)
+    found = reconstruct(shown, calibration, ["bisector"], detector=detector, least_score=0)
     # truth
     lobe, normals = mean_channel(radiance.specular), None
     if kind in ("creases", "fold_edges"):
@@ -358,7 +358,7 @@ def of_smooth(frames: int, seed: int) -> list[Detected]:
         scene = load_scene("anatomy", values | {"rig.lights": [light]})
         session = session or Session(scene)
         view = render_view(session, scene)
-        found = reconstruct(view.frame(seed + number), view.calibration, ["bisector"])
+        found = reconstruct(view.frame(seed + number), view.calibration, ["bisector"], least_score=0)
         made += of_view("smooth", session, view, found)
     return made
 
@@ -370,7 +370,7 @@ def of_tissue(frames: int, seed: int) -> list[Detected]:
         drawn_frame = rendered(plan, number)
         if drawn_frame is not None:
             session, view, family = drawn_frame
-            found = run(in_8_bits(view), told(view, family), Options(estimators=("bisector",)))
+            found = run(in_8_bits(view), told(view, family), Options(estimators=("bisector",), least_score=0))
             made += of_view("tissue", session, view, found)
     return made
 

@@ -237,6 +237,9 @@ class Floors:
     response_sd : float
         Standard deviation of a highlight's centre by a response that is not the assumed one, such as sharpening, as a
         share of the highlight's size.
+    near_miss_sd : float
+        Standard deviation an axis of the normal, rad, by the chance that a highlight of a frame of few is a near miss,
+        where it is as high as the diffuse light beside it (`simtest.estimators.prior_parts.near_miss_variance`).
     off_peak : float
         An answer that looks farther off its peak than this share of its highlight's size, beyond pixels and noise, is
         given at the peak, with the distance in its budget, or refused; 0: none is.
@@ -252,6 +255,7 @@ class Floors:
     distance_sd: float = 0.0
     feature_sd: float = 0.0
     response_sd: float = 0.0
+    near_miss_sd: float = 0.0
     off_peak: float = 0.0
 
     def __post_init__(self) -> None:
@@ -267,6 +271,7 @@ OF_PICTURES = Floors(
     fitted_number("floors.distance"),
     math.radians(fitted_number("floors.feature_deg")),
     fitted_number("floors.response"),
+    math.radians(fitted_number("near_misses.widest")),
     fitted_number("off_peak.share"),
 )
 """The floors of pictures that give none."""

@@ -103,7 +103,7 @@ as large as the part of the budget that stands for it, or smaller, never several
 would hold 99 % and more."""
 
 
-def near_miss_variance(patch: Patch, lights: int) -> float:
+def near_miss_variance(patch: Patch, lights: int, of_few: float = 0.0) -> float:
     """Return the variance of a highlight's normal along each axis by the chance that it is a near miss, rad^2.
 
     Where a surface is rough or folded, a bright spot need not hold a point at which the normal bisects the directions
@@ -118,13 +118,13 @@ def near_miss_variance(patch: Patch, lights: int) -> float:
     the width, it is at most 2 E / (e c), so that the variance goes with 1 / c. Of a clipped highlight c is the least; a
     frame most of whose highlights are clipped has a lobe that is narrower still.
 
-    `patch`: the highlight, with the frame's other ones; `lights`: how many lights there are, at least 1. Returns 0 in a
-    frame that does not show more than `CROWD` highlights for each light.
+    `patch`: the highlight, with the frame's other ones; `lights`: how many lights there are, at least 1; `of_few`: what
+    stands for `WIDEST`, rad, in a frame that does not show more than `CROWD` highlights for each light.
     """
-    if patch.others_px is not None and len(patch.others_px) + 1 <= CROWD * min(lights, APART):
-        return 0.0
+    few = patch.others_px is not None and len(patch.others_px) + 1 <= CROWD * min(lights, APART)
+    widest = of_few**2 if few else WIDEST
     scale = (SEVERAL if 1 < lights <= APART else 1.0) * (1 - NARROWER * patch.clipped_share)
-    return float(scale * WIDEST / _contrast(patch))
+    return float(scale * widest / _contrast(patch)) if widest > 0 else 0.0
 
 
 def _contrast(patch: Patch) -> float:
@@ -214,7 +214,7 @@ def add_common_parts(
         return estimate
     parts: dict[str, Array] = {}
     if family is not None and not priors.plane:
-        variance = near_miss_variance(family.patch, max(len(priors.lights_mm), 1))
+        variance = near_miss_variance(family.patch, max(len(priors.lights_mm), 1), priors.open.near_miss_sd)
         parts |= {"shape": variance * np.eye(2)} if variance > 0 else {}
     if not priors.camera.is_exact:
         if (turned := camera_part(estimate, camera, priors.camera)) is None:

@@ -182,7 +182,7 @@ def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumpti
         in_degrees = type(slope)(*map(math.degrees, vars(slope).values()))
         how = f"[surface] relief_slope_deg {key}"
         add("slope of the relief", f"{in_degrees} deg an axis, for the organ's normal", how, slope != UNTOLD_SLOPE_RAD)
-    if not priors.plane:
+    if not priors.plane and not floors.near_miss_sd:
         made.append(NEAR_MISSES)
     return made
 
@@ -190,9 +190,11 @@ def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumpti
 def _of_normals(floors: Floors, given: bool) -> list[Assumption]:
     """List the floors of each normal."""
     moved, turned = f"± {floors.response_sd:.2g} of its size", f"± {math.degrees(floors.feature_sd):.2g} deg an axis"
+    missed = f"near misses, ± {math.degrees(floors.near_miss_sd):.2g} deg an axis over the root of each one's contrast"
     each = (
         ("response, for a highlight's centre", floors.response_sd, moved, "response_floor"),
         ("features finer than a pixel, for the normal", floors.feature_sd, turned, "feature_floor_deg"),
+        ("highlights, where there are few", floors.near_miss_sd, missed, "near_miss_floor_deg"),
     )
     how = "[uncertainty] {} in a calibration file"
     return [Assumption(what, spread, how.format(key), given) for what, sd, spread, key in each if sd > 0]

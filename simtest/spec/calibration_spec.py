@@ -122,7 +122,8 @@ Floor = Annotated[float | None, Field(ge=0, le=100)]
 FLOORS = {
     "light_sd_mm": ("light_floor_mm", None), "light_sd": ("light_floor_deg", "deg"),
     "distance_sd": ("distance_floor", None), "feature_sd": ("feature_floor_deg", "deg"),
-    "response_sd": ("response_floor", None), "off_peak": ("off_peak", None),
+    "response_sd": ("response_floor", None), "near_miss_sd": ("near_miss_floor_deg", "deg"),
+    "off_peak": ("off_peak", None),
 }  # fmt: skip
 """Key and unit of each number of `Floors`."""
 
@@ -158,6 +159,11 @@ class UncertaintyCalibration(Spec):
     )
     response_floor: Floor = Field(
         None, description="of a highlight's centre by the response, share of its size; default in pictures 0.05"
+    )
+    near_miss_floor_deg: Floor = Field(
+        None,
+        description="of the normal by near misses in a picture of few highlights, an axis, deg, where a highlight is "
+        "as high as the diffuse light beside it; default in pictures 2.9",
     )
     off_peak: Floor = Field(
         None,

@@ -8,6 +8,7 @@ import pytest
 
 from simtest.advice.twin.scoring import score
 from simtest.calibration import LIGHT_AT_CAMERA, NO_PRIORS, Calibration, exactly, srgb_encode
+from simtest.calibration.priors import Floors
 from simtest.errors import Failure, Reason
 from simtest.estimators import load_estimators
 from simtest.estimators.prior_parts import CROWD, DARK, NARROWER, SEVERAL, SPREAD_PX, WIDEST, near_miss_variance
@@ -58,6 +59,14 @@ def test_the_highlights_are_counted_for_each_light():
     assert near_miss_variance(among(CROWD), 1) * np.eye(2) == pytest.approx(
         shape_of("cone_axis", among(CROWD), NO_PRIORS) - shape_of("cone_axis", among(0), NO_PRIORS), rel=1e-6
     )
+
+
+def test_in_a_picture_few_highlights_may_be_near_misses_too():
+    picture = replace(LIGHT_AT_CAMERA, floors=Floors(near_miss_sd=0.05))
+    added = shape_of("cone_axis", among(0), picture) - shape_of("cone_axis", among(0))
+    assert added == pytest.approx(0.05**2 / WIDEST * near_miss_variance(among(CROWD), 1) * np.eye(2), rel=0.01)
+    # In a crowd the other part holds, whatever the floor.
+    assert np.array_equal(shape_of("cone_axis", among(CROWD), picture), shape_of("cone_axis", among(CROWD)))
 
 
 def test_a_ring_of_lights_counts_as_three():
