@@ -46,6 +46,7 @@ from simtest.advice.twin.scoring import score
 from simtest.calibration import Calibration, Frame, Normal, Priors
 from simtest.calibration.calibration import mean_channel
 from simtest.calibration.priors import OF_PICTURES
+from simtest.detection.score import LEAST_SCORE, NAMES, features, highlight_score
 from simtest.errors import Failure, SimtestError
 from simtest.geometry import Patch
 from simtest.geometry.patch import dilated, smooth
@@ -53,7 +54,6 @@ from simtest.geometry.vectors import angle_deg, unit
 from simtest.reconstruction.options import Options
 from simtest.reconstruction.pipeline import reconstruct, run
 from simtest.reconstruction.records import Specularities, Specularity
-from simtest.reconstruction.scores import LEAST_SCORE, NAMES, features, highlight_score
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.seeds import from_integer
@@ -394,7 +394,7 @@ def score_of(each: Detected) -> float:
     spot = each.spot
     if isinstance(spot.patch, Failure):
         return 1.0
-    found = highlight_score(spot.patch, spot.highlight, each.frame, spot.estimates)
+    found = highlight_score(spot.patch, each.frame)
     return 1.0 if found is None else found
 
 

@@ -14,6 +14,7 @@ from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
 from simtest.detection.colour import ColourDetection, detect_colour
 from simtest.detection.detector import Detection, Detector, Kind, run_detector
+from simtest.detection.score import LEAST_SCORE, highlight_score
 from simtest.detection.view import View, find_view
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
@@ -28,7 +29,6 @@ from simtest.reconstruction.assumptions import border_note, calibration_of_view,
 from simtest.reconstruction.images import check_frame, check_size, image_size, read_picture
 from simtest.reconstruction.options import CLOUD, SMOOTHING_BY_COLOUR_PX, Options, check_encoding, choose
 from simtest.reconstruction.records import Specularities, Specularity
-from simtest.reconstruction.scores import LEAST_SCORE, highlight_score
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.boundary import plain_errors
 from simtest.runtime.messages import LOGGER
@@ -291,7 +291,7 @@ def _estimate(
     for i, (region, patch, highlight) in enumerate(zip(regions, patches, highlights, strict=True)):
         given = {name: each.of_patches[i] for name, each in answers.items()}
         results = {name: result for name, result in given.items() if result is not None}
-        score = None if isinstance(patch, Failure) else highlight_score(patch, highlight, frame, results)
+        score = None if isinstance(patch, Failure) else highlight_score(patch, frame)
         if not isinstance(patch, Failure):
             small = highlight is not None and math.sqrt(highlight.area_px / math.pi) < SMALL_RADIUS * frame.smoothing_px
             dim = highlight is not None and highlight.dim

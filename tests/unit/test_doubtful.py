@@ -11,12 +11,12 @@ import pytest
 from simtest import reconstruct
 from simtest.cli.common import PictureOptions
 from simtest.cli.pictures import count_lines, record_tables
+from simtest.detection.score import LEAST_SCORE
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.reconstruction import pipeline
 from simtest.reconstruction.options import Options
 from simtest.reconstruction.outputs import constraints_arrays, write_outputs
-from simtest.reconstruction.scores import LEAST_SCORE
 from simtest.reconstruction.sequence import reconstruct_sequence
 from simtest.validation.references import compare
 

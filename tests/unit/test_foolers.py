@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from simtest.detection.score import LEAST_SCORE
 from simtest.geometry import Patch, smooth
-from simtest.reconstruction.scores import LEAST_SCORE
 from simtest.spec import load_scene
 from studies.foolers import SLOW, TESTED, TRAINED, Detected, auc, is_highlight, summary
 

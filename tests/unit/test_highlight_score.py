@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Calibration, Frame
+from simtest.detection.score import LEAST_SCORE, NAMES, WEIGHTS, features, highlight_score
 from simtest.errors import Failure
 from simtest.geometry import Camera
-from simtest.reconstruction.scores import LEAST_SCORE, NAMES, WEIGHTS, features, highlight_score
 
 SIZE = 120
 Y, X = np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2
@@ -21,7 +21,7 @@ def score_of(light, smoothing_px=2.0, box=(10, 10, 100, 100), scale=1.0):
     )
     patch = frame.patch(box)
     assert not isinstance(patch, Failure), patch
-    return highlight_score(patch, None, frame, {})
+    return highlight_score(patch, frame)
 
 
 def lobe(width_px=6.0, longer=1.0, x=0.0, y=0.0):
@@ -95,10 +95,10 @@ def test_each_feature_has_its_weight():
 def test_a_score_costs_little():
     frame = Frame((lobe(15.0) + 0.1).astype(np.float32), Calibration(Camera.from_fov(30.0, SIZE, SIZE)), 2.0)
     patch = frame.patch((0, 0, SIZE, SIZE))
-    highlight_score(patch, None, frame, {})
+    highlight_score(patch, frame)
     best = np.inf
     for _ in range(20):
         start = time.process_time()
-        highlight_score(patch, None, frame, {})
+        highlight_score(patch, frame)
         best = min(best, time.process_time() - start)
     assert best < 1e-3

@@ -6,7 +6,6 @@ terminator that is steeper than the others, and a dark one beyond; a pale place 
 """
 
 import math
-from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -14,9 +13,6 @@ import numpy as np
 from simtest.calibration import Frame
 from simtest.calibration.calibration import mean_channel
 from simtest.conventions import HIGHLIGHT_ISOVALUE
-from simtest.detection.detector import Highlight
-from simtest.errors import Failure
-from simtest.estimators import Estimate
 from simtest.geometry import Patch
 from simtest.runtime.arrays import Array
 from simtest.runtime.fitted import fitted_number
@@ -46,21 +42,10 @@ LEAST_SHARE, MOST_CLIPPED = 0.01, 0.3
 """What is added to spreads, as shares of a rise, as less is noise; and the clipped share that says all."""
 
 
-def highlight_score(
-    patch: Patch, highlight: Highlight | None, frame: Frame, estimates: Mapping[str, Estimate | Failure]
-) -> float | None:
-    """Return how sure it is that a detection is a highlight, in [0, 1]; None where its patch is too small to tell.
+def highlight_score(patch: Patch, frame: Frame) -> float | None:
+    """Return how sure it is that a patch of a frame holds a highlight, in [0, 1]; None where it is too small to tell.
 
-    Parameters
-    ----------
-    patch : Patch
-        Of the detection.
-    highlight : Highlight or None
-        How the detector judged it; not used, so that those of all detectors are judged alike.
-    frame : Frame
-        That the patch was cut from.
-    estimates : mapping
-        What the estimators made of it; not used, so that the score does not depend on which of them ran.
+    Detectors and estimators do not count, so that the score does not depend on which of them ran.
     """
     found = features(patch, frame)
     return None if found is None else 1 / (1 + math.exp(-float(np.clip(BIAS + WEIGHTS @ found, -30, 30))))
