@@ -89,6 +89,7 @@ CROWD = 3
 """A frame with more highlights than this for each light shows relief or folds: a smooth patch shows one for each."""
 
 WIDEST = np.radians(fitted_number("near_misses.widest")) ** 2
+LEAST = np.radians(fitted_number("near_misses.least")) ** 2
 SPREAD_PX, NARROWER = fitted_number("near_misses.spread"), fitted_number("near_misses.narrower")
 
 LEAST_RADIUS_PX, DARK = 0.5, 0.1
@@ -115,16 +116,18 @@ def near_miss_variance(patch: Patch, lights: int, of_few: float = 0.0) -> float:
         tau^2 = 2 s^2 ln(E / (s^2 c))
 
     that a spot of contrast c can hide grows with the lobe's width until that dims the lobe's own peak to c. Whatever
-    the width, it is at most 2 E / (e c), so that the variance goes with 1 / c. Of a clipped highlight c is the least; a
-    frame most of whose highlights are clipped has a lobe that is narrower still.
+    the width, it is at most 2 E / (e c), so that the variance goes with 1 / c, down to `LEAST`. Of a clipped one c
+    is the least; a frame most of whose highlights are clipped has a lobe that is narrower still.
 
     `patch`: the highlight, with the frame's other ones; `lights`: how many lights there are, at least 1; `of_few`: what
     stands for `WIDEST`, rad, in a frame that does not show more than `CROWD` highlights for each light.
     """
     few = patch.others_px is not None and len(patch.others_px) + 1 <= CROWD * min(lights, APART)
     widest = of_few**2 if few else WIDEST
-    scale = (SEVERAL if 1 < lights <= APART else 1.0) * (1 - NARROWER * patch.clipped_share)
-    return float(scale * widest / _contrast(patch)) if widest > 0 else 0.0
+    if widest == 0:
+        return 0.0
+    share = SEVERAL if 1 < lights <= APART else 1.0
+    return float(share * max((1 - NARROWER * patch.clipped_share) * widest / _contrast(patch), LEAST))
 
 
 def _contrast(patch: Patch) -> float:

@@ -190,11 +190,11 @@ def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumpti
 def _of_normals(floors: Floors, given: bool) -> list[Assumption]:
     """List the floors of each normal."""
     moved, turned = f"± {floors.response_sd:.2g} of its size", f"± {math.degrees(floors.feature_sd):.2g} deg an axis"
-    missed = f"near misses, ± {math.degrees(floors.near_miss_sd):.2g} deg an axis over the root of each one's contrast"
+    missed = f"± {math.degrees(floors.near_miss_sd):.2g} deg an axis over the root of each one's contrast"
     each = (
-        ("response, for a highlight's centre", floors.response_sd, moved, "response_floor"),
-        ("features finer than a pixel, for the normal", floors.feature_sd, turned, "feature_floor_deg"),
-        ("highlights, where there are few", floors.near_miss_sd, missed, "near_miss_floor_deg"),
+        ("response at a highlight's centre", floors.response_sd, moved, "response_floor"),
+        ("features finer than a pixel", floors.feature_sd, turned, "feature_floor_deg"),
+        ("near misses among few highlights", floors.near_miss_sd, missed, "near_miss_floor_deg"),
     )
     how = "[uncertainty] {} in a calibration file"
     return [Assumption(what, spread, how.format(key), given) for what, sd, spread, key in each if sd > 0]

@@ -380,7 +380,7 @@ def test_pictures_have_floors_and_linear_frames_none():
     floors = {
         "light positions",
         "distance of the tissue",
-        *(what for what in named if what.startswith(("response,", "features"))),
+        *(what for what in named if what.startswith(("response at", "features"))),
     }
     assert len(floors) == 4
     assert not any(named[what].given for what in floors)
