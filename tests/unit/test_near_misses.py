@@ -64,7 +64,10 @@ def test_the_highlights_are_counted_for_each_light():
 def test_in_a_picture_few_highlights_may_be_near_misses_too():
     picture = replace(LIGHT_AT_CAMERA, floors=Floors(near_miss_sd=0.1))
     added = shape_of("cone_axis", among(0), picture) - shape_of("cone_axis", among(0))
-    assert added == pytest.approx(0.1**2 / WIDEST * near_miss_variance(among(CROWD), 1) * np.eye(2), rel=0.01)
+    expected = near_miss_variance(among(0), 1, 0.1) * np.eye(2)
+    assert added == pytest.approx(expected, rel=1e-6, abs=1e-14)
+    assert np.trace(added) > 0
+    assert near_miss_variance(among(0), 1, 0.2) == pytest.approx(4 * near_miss_variance(among(0), 1, 0.1))
     # In a crowd the other part holds, whatever the floor.
     assert np.array_equal(shape_of("cone_axis", among(CROWD), picture), shape_of("cone_axis", among(CROWD)))
 
@@ -109,8 +112,8 @@ def test_a_spot_of_few_pixels_was_brighter():
 def test_a_black_body_is_taken_for_a_dark_one():
     black = replace(lobe(1.0), diffuse=0.0)
     assert near_miss_variance(black, 1) == pytest.approx(near_miss_variance(lobe(1 / DARK), 1))
-    beside_bright = replace(black, others_value=tuple(4 * value for value in black.others_value))
-    assert near_miss_variance(beside_bright, 1) == pytest.approx(4 * near_miss_variance(black, 1))
+    brighter, twice = (replace(black, others_value=tuple(k * value for value in black.others_value)) for k in (4, 8))
+    assert near_miss_variance(twice, 1) == pytest.approx(2 * near_miss_variance(brighter, 1))
 
 
 def test_where_highlights_are_clipped_the_lobe_is_narrower():
