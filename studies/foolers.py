@@ -46,7 +46,7 @@ from simtest.advice.twin.scoring import score
 from simtest.calibration import Calibration, Frame, Normal, Priors
 from simtest.calibration.calibration import mean_channel
 from simtest.calibration.priors import OF_PICTURES
-from simtest.detection.score import LEAST_SCORE, NAMES, features, highlight_score
+from simtest.detection.score import LEAST_SCORE, NAMES, features, highlight_scores
 from simtest.errors import Failure, SimtestError
 from simtest.geometry import Patch
 from simtest.geometry.patch import dilated, smooth
@@ -394,7 +394,7 @@ def score_of(each: Detected) -> float:
     spot = each.spot
     if isinstance(spot.patch, Failure):
         return 1.0
-    found = highlight_score(spot.patch, each.frame)
+    found = highlight_scores([spot.patch], each.frame)[0]
     return 1.0 if found is None else found
 
 
@@ -409,7 +409,9 @@ def auc(scores: Array, true: Array) -> float:
 
 def fit(detected: Sequence[Detected]) -> Array:
     """Return the score's bias and weights by logistic regression; the true and the false of each kind count alike."""
-    seen = [(each, features(each.spot.patch, each.frame)) for each in detected if isinstance(each.spot.patch, Patch)]
+    seen = [
+        (each, features([each.spot.patch], each.frame)[0]) for each in detected if isinstance(each.spot.patch, Patch)
+    ]
     rows = [(each, found) for each, found in seen if found is not None]
     x, true = np.array([found for _, found in rows]), np.array([each.true for each, _ in rows])
     groups = [(each.kind, each.true) for each, _ in rows]

@@ -6,15 +6,16 @@ terminator that is steeper than the others, and a dark one beyond; a pale place 
 """
 
 import math
-from functools import lru_cache
+from collections.abc import Sequence
 
 import numpy as np
 
 from simtest.calibration import Frame
 from simtest.calibration.calibration import mean_channel
 from simtest.conventions import HIGHLIGHT_ISOVALUE
+from simtest.errors import Failure
 from simtest.geometry import Patch
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, Image
 from simtest.runtime.fitted import fitted_number
 
 NAMES = ("uneven", "ground", "bright", "flat", "clipped")
@@ -42,17 +43,28 @@ LEAST_SHARE, MOST_CLIPPED = 0.01, 0.3
 """What is added to spreads, as shares of a rise, as less is noise; and the clipped share that says all."""
 
 
-def highlight_score(patch: Patch, frame: Frame) -> float | None:
-    """Return how sure it is that a patch of a frame holds a highlight, in [0, 1]; None where it is too small to tell.
+def highlight_scores(patches: Sequence[Patch | Failure], frame: Frame) -> list[float | None]:
+    """Return how sure it is that each patch of a frame holds a highlight, in [0, 1]; None if it is too small.
 
     Detectors and estimators do not count, so that the score does not depend on which of them ran.
     """
-    found = features(patch, frame)
-    return None if found is None else 1 / (1 + math.exp(-float(np.clip(BIAS + WEIGHTS @ found, -30, 30))))
+    return [
+        None if found is None else 1 / (1 + math.exp(-float(np.clip(BIAS + WEIGHTS @ found, -30, 30))))
+        for found in features(patches, frame)
+    ]
 
 
-def features(patch: Patch, frame: Frame) -> Array | None:
-    """Return what a score is made of, shape (5,), in the order of `NAMES`; None where a patch shows too little."""
+def features(patches: Sequence[Patch | Failure], frame: Frame) -> list[Array | None]:
+    """Return what each score is made of, shape (5,), in the order of `NAMES`; None where a patch shows too little."""
+    channels, seen = frame.channels, frame.seen
+    total, brightest = mean_channel(channels), float((channels if seen is None else channels[seen]).max(initial=0.0))
+    # Of a colour frame's patch, which holds the specular part alone, all light counts.
+    of = None if frame.light is None else total
+    return [None if isinstance(each, Failure) else _features(each, total, of, brightest) for each in patches]
+
+
+def _features(patch: Patch, total: Image, of: Image | None, brightest: float) -> Array | None:
+    """Return the features of a patch: `total` is all light of its frame, `of` what it is seen in, if not in itself."""
     step = max(1, round(max(patch.values.shape) / MOST_SIDE))
     values = np.asarray(patch.values[::step, ::step], dtype=float)
     inside = patch.inside(HIGHLIGHT_ISOVALUE, cut=True)
@@ -74,14 +86,15 @@ def features(patch: Patch, frame: Frame) -> Array | None:
     )
     if not (contour.any() and around.any()):
         return None
-    # all light, of which a colour frame's patch holds the specular part alone
     (left, top), (h, w) = patch.origin_px, patch.values.shape
-    total = mean_channel(frame.channels[top : top + h : step, left : left + w : step])
-    brightness = float(total[thin].max()) / max(_brightest(frame), 1e-12)
-    light = values if frame.light is None else total
+    crop = np.s_[top : top + h : step, left : left + w : step]
+    brightness = float(total[crop][thin].max()) / max(brightest, 1e-12)
+    light = values if of is None else of[crop]
     ring = light[around]
     peak = float(light[centre].mean() if centre.any() else light[thin].max())
-    rise = max(peak - float(np.median(ring)), LEAST_SHARE * peak, 1e-12)
+    ranked = np.sort(ring)
+    ground = float(ranked[(len(ranked) - 1) // 2] + ranked[len(ranked) // 2]) / 2  # the median, without masked arrays
+    rise = max(peak - ground, LEAST_SHARE * peak, 1e-12)
     # how evenly light falls where it has fallen to half: on an ellipse x . grad I is one number
     by_row, by_column = np.gradient(values)
     falls = -(by_column * across + by_row * down)[contour]
@@ -99,10 +112,3 @@ def features(patch: Patch, frame: Frame) -> Array | None:
             min(clipped, MOST_CLIPPED),
         ]
     )
-
-
-@lru_cache(maxsize=4)
-def _brightest(frame: Frame) -> float:
-    """Return the brightest value of any channel of a frame in its view."""
-    light = frame.channels if frame.seen is None else frame.channels[frame.seen]
-    return float(light.max()) if light.size else 0.0

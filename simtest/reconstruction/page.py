@@ -67,7 +67,7 @@ def write_picture_page(path: Path, spots: Specularities, picture: Image) -> None
     clouds = bool(spots.clouds)
     write_page(
         path, "picture.html.j2", data, record=spots, stated=stated, organ=spots.stated_of_organ,
-        of_organ=spots.of_organ, rule_note=spots.rule_note,
+        of_organ=spots.of_organ, rule_note=spots.rule_note, doubts=spots.doubts,
         told=list(parts.items()), picture=_address(picture),
         title=Path(spots.image).name, width=width, height=height, palette=palette, best=best,
         answered=sum(best.values()), clouds=clouds, terms=explanations.TERMS,

@@ -14,7 +14,7 @@ from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
 from simtest.detection.colour import ColourDetection, detect_colour
 from simtest.detection.detector import Detection, Detector, Kind, run_detector
-from simtest.detection.score import LEAST_SCORE, highlight_score
+from simtest.detection.score import LEAST_SCORE, highlight_scores
 from simtest.detection.view import View, find_view
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
@@ -277,6 +277,7 @@ def _estimate(
         )
         for i, patch in enumerate(cut[: len(regions)])
     ]  # fmt: skip
+    scores = [score and round(score, 4) for score in highlight_scores(patches, frame)]
     camera, priors = frame.calibration.camera, frame.calibration.priors
     prepare(list(estimators.values()), patches, camera)
     relief = relief_part(priors)
@@ -288,16 +289,14 @@ def _estimate(
         no_cloud = failures[0] if failures else Failure(Reason.NO_ESTIMATE, "no highlight was found")
     least = LEAST_SCORE if options.least_score is None else options.least_score
     spots = []
-    for i, (region, patch, highlight) in enumerate(zip(regions, patches, highlights, strict=True)):
+    for i, (region, patch, highlight, score) in enumerate(zip(regions, patches, highlights, scores, strict=True)):
         given = {name: each.of_patches[i] for name, each in answers.items()}
         results = {name: result for name, result in given.items() if result is not None}
-        score = None if isinstance(patch, Failure) else highlight_score(patch, frame)
         if not isinstance(patch, Failure):
             small = highlight is not None and math.sqrt(highlight.area_px / math.pi) < SMALL_RADIUS * frame.smoothing_px
             dim = highlight is not None and highlight.dim
             results = {name: _flagged(each, patch, frame, small, dim) for name, each in results.items()}
         organ = {name: to_base(each, relief) for name, each in results.items() if isinstance(each, Estimate)}
-        score = score and round(score, 4)
         spots.append(Specularity(region, patch, results, highlight, camera, options.target, organ, score, least))
     box = options.roi
     undetected = [

@@ -532,7 +532,7 @@ ROWS = (
     row("twins: frames of many highlights count for more", "counts", "advice.twin.scoring:Matcher.__init__",
         "1 / np.bincount(self._frames)[self._frames]", "np.ones(len(self._frames))", "twin"),
     row("twins: coverage over all, not over those that report", "counts", "advice.twin.scoring:Matcher.find",
-        "stated @ self._held / stated.sum()", "stated @ self._held / weights.sum()", "twin"),
+        "stated / stated.sum() if", "stated / weights.sum() if", "twin"),
     # report
     row("laws that are met lie beyond their tolerance", "counts", "report.error_laws:LawResult.met",
         "<= self.tolerance", "> self.tolerance", "report_tables"),

@@ -12,7 +12,7 @@ from simtest import reconstruct
 from simtest.cli.common import PictureOptions
 from simtest.cli.pictures import count_lines, record_tables
 from simtest.detection.score import LEAST_SCORE
-from simtest.errors import InputError
+from simtest.errors import Failure, InputError
 from simtest.geometry import Camera
 from simtest.reconstruction import pipeline
 from simtest.reconstruction.options import Options
@@ -37,7 +37,11 @@ def picture(shift=0.0):
 @pytest.fixture(autouse=True)
 def _scored(monkeypatch):
     """Give a score of 0.3 to the dimmer highlight, and of 0.6 to the other."""
-    monkeypatch.setattr(pipeline, "highlight_score", lambda patch, *_: 0.3 if patch.peak_px[0] > 160 else 0.6)
+
+    def scores(patches, _):
+        return [None if isinstance(patch, Failure) else 0.3 if patch.peak_px[0] > 160 else 0.6 for patch in patches]
+
+    monkeypatch.setattr(pipeline, "highlight_scores", scores)
 
 
 def found(least=0.4, **more):
@@ -57,7 +61,7 @@ def test_it_has_no_best_normal_and_keeps_its_estimates(detector):
 
 
 def test_the_threshold_is_the_fitted_one_unless_it_is_given(monkeypatch):
-    monkeypatch.setattr(pipeline, "highlight_score", lambda *_: LEAST_SCORE - 1e-3)
+    monkeypatch.setattr(pipeline, "highlight_scores", lambda patches, _: [LEAST_SCORE - 1e-3] * len(patches))
     assert {spot.least_score for spot in found(None)} == {LEAST_SCORE}
     assert not any(spot.best for spot in found(None))
 

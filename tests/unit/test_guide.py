@@ -417,7 +417,8 @@ def test_conditions_are_of_the_values_that_are_drawn():
 def test_summary_json_holds_conditions_and_descriptions():
     experiment = load_experiment("relief")
     cases = expand(experiment)
-    rows = pl.DataFrame(rows_of("cone_axis", [1.0], cases[0].setting, mahalanobis2=None, error_oracle_deg=1.0))
+    none = dict.fromkeys(("mahalanobis2", "cov_11", "cov_22"))
+    rows = pl.DataFrame(rows_of("cone_axis", [1.0], cases[0].setting, error_oracle_deg=1.0, **none))
     content = summarise_run(experiment, cases, rows).model_dump(mode="json")
     assert content["estimators"] == {name: DESCRIPTIONS[name] for name in experiment.estimators}
     assert list(content["conditions"]) == list(conditions_of(cases))

@@ -20,7 +20,7 @@ def test_a_picture_climbs_four_times_through_five_packages(tmp_path, detector):
     with pytest.warns(UserWarning, match="angles depend"):
         way = trace("reconstruct", str(file), ["--fov", "60", "--detector", detector])
     assert way.passed == [
-        "reconstruction", "calibration", "reconstruction", "detection", "calibration", "reconstruction", "estimators",
+        "reconstruction", "calibration", "reconstruction", "detection", "calibration", "reconstruction", "detection",
         "calibration", "reconstruction", "estimators", "reconstruction", "pages",
     ]  # fmt: skip
     assert way.climbs == 4
