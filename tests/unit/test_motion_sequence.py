@@ -44,6 +44,7 @@ light_floor_deg = 0.0
 distance_floor = 0.0
 feature_floor_deg = 0.0
 response_floor = 0.0
+near_miss_floor_deg = 0.0
 off_peak = 0.0
 """
 # d k, the camera's steps, mm, and what must be told; beyond its centre a highlight runs ahead of the camera.
