@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from simtest.calibration import CameraPrior, Distribution, Normal, Priors
-from simtest.calibration.priors import AT_CAMERA_MM
+from simtest.calibration.priors import AT_CAMERA_MM, OF_PICTURES
 from simtest.estimators.budget import equivalent_covariance
 from simtest.estimators.protocol import Estimate
 from simtest.estimators.small_spots import GAUSSIAN_RADIUS2, HighlightAxis, smoothed_radius
@@ -88,7 +88,7 @@ def _moves(angle: float, lights: Array, distance: Array) -> Array:
 CROWD = 3
 """A frame with more highlights than this for each light shows relief or folds: a smooth patch shows one for each."""
 
-WIDEST = np.radians(fitted_number("near_misses.widest")) ** 2
+WIDEST = OF_PICTURES.near_miss_sd**2
 LEAST = np.radians(fitted_number("near_misses.least")) ** 2
 SPREAD_PX, NARROWER = fitted_number("near_misses.spread"), fitted_number("near_misses.narrower")
 

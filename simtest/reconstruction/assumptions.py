@@ -182,7 +182,7 @@ def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumpti
         in_degrees = type(slope)(*map(math.degrees, vars(slope).values()))
         how = f"[surface] relief_slope_deg {key}"
         add("slope of the relief", f"{in_degrees} deg an axis, for the organ's normal", how, slope != UNTOLD_SLOPE_RAD)
-    if not priors.plane and not floors.near_miss_sd:
+    if not priors.plane:
         made.append(NEAR_MISSES)
     return made
 
