@@ -291,6 +291,7 @@ def table(*rows, within=0.0, part=False):
         (table("plane | 0.017 | 32"), "plane: 0.01721 and 32.4"),
         (table("k d = -0.5 | 1,036"), "k d = -0.5 | 1036"),
         (table("1 | 9e-12"), "1 | 9.8e-12"),
+        (table("1 | 1.3e-15"), "1 | 6.4e-15"),
         (table("a | 0.5", "b | 0.7"), "b | 0.7\na | 0.5"),
         (table("a | 100", within=0.05), "a | 104"),
         (table("a | 0.5 | 0.9", part=True), "a | 0.5 | 7 | 0.9 | 3"),
