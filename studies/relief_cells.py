@@ -30,6 +30,7 @@ from simtest.runtime.seeds import from_integer
 from simtest.simulation.frame import render_view
 from simtest.spec import Scene, load_scene
 from simtest.spec.reflectance import RoughPlasticReflectance
+from simtest.validation.statistics import is_wrong_and_sure
 from studies.one_light import COLOUR, ORGANS, in_8_bits, told, with_distance
 
 SLOPES_DEG, ALPHAS = (2.0, 4.0, 6.0), (0.03, 0.1, 0.2)
@@ -154,7 +155,7 @@ def _line(name: str, rows: Sequence[Row]) -> list[str]:
     frames = len({(row["slope"], row["alpha"], row["frame"]) for row in rows})
     near = float(np.mean([row["kind"] == "near_miss" for row in rows]))
     rms = [f"{math.sqrt(float(np.mean(each**2))):.2f}" for each in (error, reported)]
-    sure = float(np.mean((error > 5) & (error > 3 * reported)))
+    sure = float(np.mean(is_wrong_and_sure(error, reported)))
     shares = [f"{100 * _share(rows, 'held'):.1f} %", f"{100 * sure:.1f} %"]
     return [name, str(frames), str(len(rows)), f"{100 * near:.0f} %", *rms, *shares]
 

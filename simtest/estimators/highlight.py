@@ -7,13 +7,12 @@ from typing import Any, cast
 import numpy as np
 
 from simtest.calibration import NO_PRIORS, Priors
-from simtest.calibration.priors import AT_CAMERA_MM
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget
 from simtest.estimators.family import IsophoteFamily, fit_isophote_families
 from simtest.estimators.isophotes import FittedIsophote, fit_isophote_of_each
-from simtest.estimators.prior_parts import add_untold_parts
+from simtest.estimators.prior_parts import add_untold_parts, facing
 from simtest.estimators.protocol import Estimate
 from simtest.estimators.small_spots import HighlightAxis, SmallSpot, fit_small_spots, is_small
 from simtest.geometry import Array, Camera, Patch
@@ -108,19 +107,10 @@ def look_at_peak(family: Fitted, priors: Priors) -> Fitted:
     to_px = np.linalg.inv(family.basis @ camera.step_of_pixels(patch.peak_px).T)
     size, noise = (to_px @ each @ to_px.T for each in (family.seen_moments, family.peak_noise))
     # The shading moves the peak too, the more the broader the highlight is.
-    facing2 = max(
-        (_facing(camera.unproject(patch.peak_px), light, priors) ** 2 for light in priors.lights), default=0.0
-    )
+    facing2 = facing(camera.unproject(patch.peak_px), priors) ** 2
     pixel2 = float(np.sqrt(np.linalg.det(family.px2)))
     shape = ((BY_GAP * gap_px) ** 2 + facing2 / 2 / pixel2) * np.eye(2) + BY_SIZE**2 * size
     return SmallSpot(patch, camera, patch.peak_px, size, noise, shape, flags=("off_peak",))
-
-
-def _facing(sightline: Array, light: Array, priors: Priors) -> float:
-    """Return the angle, rad, between the normal that faces a light and the one that bisects it and the camera."""
-    to_light = light - priors.distance.mean * sightline
-    cosine = -float(to_light @ sightline) / max(float(np.linalg.norm(to_light)), AT_CAMERA_MM)
-    return float(np.arccos(np.clip(cosine, -1.0, 1.0))) / 2
 
 
 def isophote_of_each(

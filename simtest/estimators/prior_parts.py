@@ -141,6 +141,13 @@ def _contrast(patch: Patch) -> float:
     return (1 - base) * patch.peak_value / diffuse * (1 + SPREAD_PX**2 / size2)
 
 
+def facing(sightline: Array, priors: Priors) -> float:
+    """Return the largest angle, rad, between the normal facing a told light and the one bisecting it and the camera."""
+    to_lights = priors.lights - priors.distance.mean * sightline
+    cosines = -(to_lights @ sightline) / np.maximum(np.linalg.norm(to_lights, axis=-1), AT_CAMERA_MM)
+    return float(np.arccos(np.clip(cosines, -1.0, 1.0)).max(initial=0.0)) / 2
+
+
 NEAR_SHARE = 0.05
 """Share of the distances that are nearer than the one at which a told light's offset must be negligible."""
 
@@ -218,6 +225,9 @@ def add_common_parts(
     parts: dict[str, Array] = {}
     if family is not None and not priors.plane:
         variance = near_miss_variance(family.patch, max(len(priors.lights_mm), 1), priors.open.near_miss_sd)
+        if priors.open.off_peak > 0 and (score := family.patch.score) is not None:
+            # The lower the score, the rather it is the maximum of a body's shading, which faces the light.
+            variance += (1 - score) * facing(family.axis, priors) ** 2 / 2
         parts |= {"shape": variance * np.eye(2)} if variance > 0 else {}
     if not priors.camera.is_exact:
         if (turned := camera_part(estimate, camera, priors.camera)) is None:

@@ -80,6 +80,8 @@ class Patch:
         the specular part of a colour frame.
     clipped_share : float
         Share of the frame's highlights that are clipped.
+    score : float, optional
+        How sure it is that this is a highlight, in [0, 1] (`simtest.detection.score`); None: not known.
     found : optional
         The level sets found so far: those of the patch that this one is a copy of, where it has the same.
     kept : dict
@@ -109,6 +111,7 @@ class Patch:
     others_value: tuple[float, ...] = ()
     diffuse: float = 0.0
     clipped_share: float = 0.0
+    score: float | None = None
     found: _LevelSets | None = field(default=None, compare=False, repr=False)
     kept: dict[Hashable, tuple[object, object]] = field(default_factory=dict, init=False, compare=False, repr=False)
 

@@ -268,16 +268,16 @@ def _estimate(
     values = [0.0 if isinstance(patch, Failure) else patch.peak_value for patch in cut]
     masks = [patch.saturated for patch in cut if not isinstance(patch, Failure)]
     clipped = sum(mask is not None and np.count_nonzero(mask) >= MIN_CLIPPED_PX for mask in masks) / max(len(masks), 1)
+    scores = [score and round(score, 4) for score in highlight_scores(cut[: len(regions)], frame)]
     patches = [
         patch
         if isinstance(patch, Failure)
         else replace(
             patch, others_px=(*peaks[:i], *peaks[i + 1 :]), others_value=(*values[:i], *values[i + 1 :]),
-            clipped_share=clipped,
+            clipped_share=clipped, score=score,
         )
-        for i, patch in enumerate(cut[: len(regions)])
+        for i, (patch, score) in enumerate(zip(cut, scores, strict=False))
     ]  # fmt: skip
-    scores = [score and round(score, 4) for score in highlight_scores(patches, frame)]
     camera, priors = frame.calibration.camera, frame.calibration.priors
     prepare(list(estimators.values()), patches, camera)
     relief = relief_part(priors)

@@ -390,6 +390,7 @@ def patch_request(patch: Patch, camera: Camera, priors: Priors, hello: Hello) ->
         "others_value": [float(value) for value in patch.others_value],
         "diffuse": float(patch.diffuse),
         "clipped_share": float(patch.clipped_share),
+        "score": patch.score,
     }
     return _header("patch", camera, priors, about, missing), arrays
 

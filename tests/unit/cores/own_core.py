@@ -75,7 +75,7 @@ def patch_of(told, arrays):
         arrays["values"], tuple(told["origin_px"]), np.array(told["peak_px"]), told["peak_value"],
         tuple(told["peak_pixel"]), arrays.get("saturated"), seen, arrays.get("raw"), noise, told["smoothing_px"],
         tuple(map(tuple, told["others_px"])), tuple(told["others_value"]),
-        diffuse=told["diffuse"], clipped_share=told["clipped_share"],
+        diffuse=told["diffuse"], clipped_share=told["clipped_share"], score=told["score"],
     )  # fmt: skip
 
 
