@@ -25,18 +25,17 @@ import cv2
 import numpy as np
 
 from benchmarks.measuring import print_markdown
-from simtest.calibration import Calibration, Priors, Uniform
+from simtest.calibration import Calibration, Priors, Uniform, srgb_encode
 from simtest.calibration.priors import NO_FLOORS, OF_PICTURES
 from simtest.detection import classify
 from simtest.detection.detector import Kind
-from simtest.errors import SimtestError
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.reconstruction.records import Specularities
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image
 from simtest.runtime.seeds import from_integer
 from simtest.spec import Scene, load_scene, scene_from_dict
-from studies.off_peak import scored
+from studies.off_peak import rendered_in_turn, scored
 from studies.one_light import OneLight, in_8_bits, rendered, told
 
 Row = dict[str, Any]
@@ -92,7 +91,7 @@ def picture(light: Image, random: np.random.Generator) -> Image:
     linear = cv2.GaussianBlur(light / max(level, 1e-12), (0, 0), random.uniform(0.5, 1.0))
     noise = np.sqrt(linear / random.uniform(4000, 20000) + READ_NOISE**2)
     linear = np.clip(linear + noise * random.standard_normal(light.shape), 0, 1)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    encoded = srgb_encode(linear)
     if random.random() < 0.7:
         soft = cv2.GaussianBlur(encoded, (0, 0), random.uniform(1.4, 2.6))
         encoded = encoded + random.uniform(0.4, 1.4) * (encoded - soft)
@@ -108,17 +107,9 @@ def picture(light: Image, random: np.random.Generator) -> Image:
 
 def frames(organ: str, count: int, seed: int) -> Iterator[tuple[Session, Scene, Image]]:
     """Return the pictures of an organ."""
-    session: Session | None = None
-    for number in range(count):
-        made = scene_from_dict(scene(organ, number, seed))
-        try:
-            session = session or Session(made, "llvm_ad_rgb")
-            session.update(made)
-        except SimtestError as error:
-            print(f"{organ} {number}: {error}", file=sys.stderr)
-            continue
-        light = session.radiance().total
-        yield session, made, picture(light if made.is_coloured else light[..., 0], from_integer(1000 * seed + number))
+    scenes = (scene_from_dict(scene(organ, number, seed)) for number in range(count))
+    for number, session, made, light in rendered_in_turn(organ, scenes):
+        yield session, made, picture(light, from_integer(1000 * seed + number))
 
 
 def statements(made: Scene) -> Iterator[tuple[str, Calibration]]:

@@ -14,7 +14,7 @@ any other seed the other kinds.
 import json
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from benchmarks.measuring import print_markdown
-from simtest.calibration import Calibration, Normal, Priors
+from simtest.calibration import Calibration, Normal, Priors, srgb_encode
 from simtest.calibration.priors import NO_FLOORS, OF_PICTURES
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, SimtestError
@@ -35,7 +35,7 @@ from simtest.reconstruction.records import Specularity
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image
 from simtest.runtime.seeds import from_integer
-from simtest.spec import scene_from_dict
+from simtest.spec import Scene, scene_from_dict
 from simtest.validation.statistics import is_wrong_and_sure
 
 Row = dict[str, Any]
@@ -92,25 +92,30 @@ def picture(light: Image, random: np.random.Generator) -> Image:
     scale = float(np.quantile(light, 0.9995)) * random.uniform(0.8, 1.6)
     linear = cv2.GaussianBlur(light / max(scale, 1e-12), (0, 0), random.uniform(0.5, 1.0))
     linear = np.clip(linear + random.normal(0, 0.004, light.shape), 0, 1)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    encoded = srgb_encode(linear)
     return np.asarray(np.rint(255 * encoded), dtype=np.uint8)
+
+
+def rendered_in_turn(name: str, scenes: Iterable[Scene]) -> Iterator[tuple[int, Session, Scene, Image]]:
+    """Return number, session, scene and light of each scene, grey or coloured; those without a picture are named."""
+    session: Session | None = None
+    for number, made in enumerate(scenes):
+        try:
+            session = session or Session(made, "llvm_ad_rgb")
+            session.update(made)
+        except SimtestError as error:
+            print(f"{name} {number}: {error}", file=sys.stderr)
+            continue
+        light = session.radiance().total
+        yield number, session, made, light if made.is_coloured else light[..., 0]
 
 
 def frames(body: str, count: int, seed: int) -> Iterator[tuple[Session, Image, Calibration]]:
     """Return the pictures of a kind with what a user would give of each."""
     for shape, share in SHAPES.items():
-        session: Session | None = None
-        for number in range(math.ceil(share * count)):
-            made = scene_from_dict(scene(body, shape, number, seed))
-            try:
-                session = session or Session(made, "llvm_ad_rgb")
-                session.update(made)
-            except SimtestError as error:
-                # a light inside the surface
-                print(f"{body}, {shape} {number}: {error}", file=sys.stderr)
-                continue
-            light = session.radiance().total
-            shown = picture(light if made.is_coloured else light[..., 0], from_integer(1000 * seed + number + 500))
+        scenes = (scene_from_dict(scene(body, shape, number, seed)) for number in range(math.ceil(share * count)))
+        for number, session, made, light in rendered_in_turn(f"{body}, {shape}", scenes):
+            shown = picture(light, from_integer(1000 * seed + number + 500))
             middle = float(getattr(made.surface, "distance_mm", 0.0) or np.nanmedian(session.depths()))
             lights, distance = (made.rig.lights[0].nominal_mm,), Normal(middle, 0.1 * middle)
             priors = Priors(lights, distance, falloff_power=None, floors=OF_PICTURES)

@@ -23,6 +23,7 @@ import numpy as np
 from benchmarks.measuring import print_markdown
 from simtest.advice.twin.scoring import score
 from simtest.errors import SimtestError
+from simtest.estimators.prior_parts import CROWD
 from simtest.reconstruction.options import Options, default_estimators
 from simtest.reconstruction.pipeline import run
 from simtest.rendering import Session
@@ -139,8 +140,9 @@ def report(rows: Sequence[Row]) -> int:
         for alpha in ALPHAS
     }
     organs = {organ: [row for row in rows if row["organ"] == organ] for organ in ORGANS}
+    few = {f"frames of 1 to {CROWD} highlights": [row for row in rows if float(row["count"]) <= CROWD]}
     head = ["", "frames", "n", "near misses", "RMS error, deg", "reported, deg", "covered", "wrong and sure"]
-    lines = [_line(name, part) for name, part in {**cells, **organs, "all": [*rows]}.items() if part]
+    lines = [_line(name, part) for name, part in {**cells, **organs, **few, "all": [*rows]}.items() if part]
     print_markdown([head, *lines])
     low, high = AIMED_AT
     return int(any(not part or not low <= _share(part, "held") <= high for part in cells.values()))

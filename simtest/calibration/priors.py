@@ -242,7 +242,8 @@ class Floors:
         where it is as high as the diffuse light beside it (`simtest.estimators.prior_parts.near_miss_variance`).
     off_peak : float
         An answer that looks farther off its peak than this share of its highlight's size, beyond pixels and noise, is
-        given at the peak, with the distance in its budget, or refused; 0: none is.
+        given at the peak, with the distance in its budget, or refused; 0: none is. Above 0 the chance that a highlight
+        is the maximum of a body's shading, which faces a given light, counts too: the lower its score, the more.
 
     Raises
     ------

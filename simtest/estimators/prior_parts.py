@@ -226,8 +226,9 @@ def add_common_parts(
     if family is not None and not priors.plane:
         variance = near_miss_variance(family.patch, max(len(priors.lights_mm), 1), priors.open.near_miss_sd)
         if priors.open.off_peak > 0 and (score := family.patch.score) is not None:
-            # The lower the score, the rather it is the maximum of a body's shading, which faces the light.
-            variance += (1 - score) * facing(family.axis, priors) ** 2 / 2
+            # The lower the score, the rather it is the maximum of a body's shading, which faces the light, or that of a
+            # part of it which shadows cut off: along each axis as far again.
+            variance += (1 - score) * facing(family.axis, priors) ** 2
         parts |= {"shape": variance * np.eye(2)} if variance > 0 else {}
     if not priors.camera.is_exact:
         if (turned := camera_part(estimate, camera, priors.camera)) is None:

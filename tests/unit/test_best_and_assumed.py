@@ -10,9 +10,10 @@ import pytest
 
 import simtest
 from simtest.calibration import NO_PRIORS, CameraPrior, Priors, Uniform, exactly, srgb_encode
-from simtest.calibration.priors import OF_PICTURES, Floors
+from simtest.calibration.priors import NO_FLOORS, OF_PICTURES, Floors
 from simtest.detection import Region
 from simtest.errors import Failure, InputError, Reason
+from simtest.estimators.names import load_estimators
 from simtest.estimators.process.messages import priors_message
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import KannalaBrandt, ViewMask
@@ -389,3 +390,25 @@ def test_pictures_have_floors_and_linear_frames_none():
     others = [each for spots in (open_, linear) for each in spots.choices.assumed]
     assert not floors & {each.what for each in others}
     assert not any("_floor" in each.how_to_narrow for each in others)
+
+
+def test_what_may_be_the_maximum_of_shading_has_a_region_that_holds_the_normal_that_faces_the_light():
+    camera = simtest.Camera.from_fov(40.0, 200, 160)
+    x, y = np.meshgrid(np.arange(200), np.arange(160))
+    spot = 0.1 + 0.6 * np.exp(-((x - 100) ** 2 + (y - 80) ** 2) / 200)
+    patch = simtest.Patch.cut(spot, (60, 40, 80, 80), noise=1e-3)
+
+    def answer(score, light=(60.0, 0.0, 0.0), floors=OF_PICTURES):
+        priors = Priors((light,), exactly(100.0), falloff_power=None, floors=floors)
+        return load_estimators(["bisector"])["bisector"].estimate(replace(patch, score=score), camera, priors)
+
+    sightline = camera.unproject(patch.peak_px)
+    to_light = np.array([60.0, 0.0, 0.0]) - 100 * sightline
+    off = np.degrees(np.arccos(answer(0.0).normal @ to_light / np.linalg.norm(to_light)))
+    assert off > 10
+    assert off < 1.5 * answer(0.3).deviation_deg
+    assert off > 3 * answer(1.0).deviation_deg
+    # a light at the camera, a render, and a patch without a score have no such part
+    for told in ({"light": (0.0, 0.0, 0.0)}, {"floors": NO_FLOORS}):
+        assert answer(0.0, **told).deviation_deg == answer(1.0, **told).deviation_deg
+    assert answer(None).deviation_deg == answer(1.0).deviation_deg

@@ -36,7 +36,7 @@ def picture(shift=0.0):
 
 @pytest.fixture(autouse=True)
 def _scored(monkeypatch):
-    """Give a score of 0.3 to the dimmer highlight, and of 0.6 to the other."""
+    """The dimmer highlight has a score of 0.3, the other one of 0.6."""
 
     def scores(patches, _):
         return [None if isinstance(patch, Failure) else 0.3 if patch.peak_px[0] > 160 else 0.6 for patch in patches]
