@@ -69,7 +69,7 @@ def _fine_normals(session: Session, quantity: str, film: dict[str, Any]) -> Law:
     spec = session.scene
     truth, field = session.truth(), make_relief(Relief.model_validate(RELIEF), spec.film_level, spec.film_patches)
     points = truth.position[truth.mask]
-    step = 1e-3
+    step = 2e-4
 
     def slope(axis: Array) -> Array:
         return (field.jets(session.to_model(points + step * axis)).value
@@ -79,7 +79,7 @@ def _fine_normals(session: Session, quantity: str, film: dict[str, Any]) -> Law:
     # Height counts towards the camera, along -z: where it rises the normal leans back.
     normal = np.stack([-x, -y, -np.ones_like(x)], axis=-1)
     off = by_hand.angle_deg(truth.normal[truth.mask], normal).max()
-    about = "a rise of the height turns the normal away from it; differences of 1e-3 mm"
+    about = "a rise of the height turns the normal away from it; differences of 2e-4 mm"
     return law("relief", quantity, "deg", float(off), 1e-3, n=len(points), about=about)
 
 
