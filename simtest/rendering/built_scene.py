@@ -16,7 +16,7 @@ from simtest.rendering.backend import mi
 from simtest.rendering.elements import lights as light_elements
 from simtest.rendering.kernel_values import MitsubaDict, spectrum
 from simtest.rendering.lighting import DirectLight
-from simtest.rendering.tissue_kernels import AlbedoKernel
+from simtest.rendering.tissue_kernels import AlbedoKernel, ReliefKernel
 from simtest.rendering.truth import ShapeLabels
 from simtest.runtime.arrays import Array
 from simtest.spec.lights import LightSpec, Rig
@@ -111,11 +111,16 @@ class BuiltScene:
         self.parameters.update()
         return DirectLight(rig, poses)
 
-    def let_bounces_find(self, albedo: AlbedoKernel) -> None:
-        """Let bounced light find the albedo of tissue by its own points."""
+    def let_bounces_find(self, albedo: AlbedoKernel | None, film: ReliefKernel | None) -> None:
+        """Let bounced light find albedo and roughness of tissue by its own points, where they vary."""
         # Weak: what a BSDF holds, Mitsuba holds, and Python could not free it at its end.
-        kernel = weakref.proxy(albedo)
-        self.scene.shapes()[0].bsdf().albedo_at = lambda si, active: kernel.of(si, active)
+        bsdf = self.scene.shapes()[0].bsdf()
+        if albedo is not None:
+            colour = weakref.proxy(albedo)
+            bsdf.albedo_at = lambda si, active: colour.of(si, active)
+        if film is not None:
+            relief = weakref.proxy(film)
+            bsdf.wet_at = lambda si, active: relief.wet_at(si, active)
 
     def _set(self, suffix: str, value: Any) -> None:
         """Assign the one parameter whose path ends in `suffix`; Mitsuba names paths by its own rules."""

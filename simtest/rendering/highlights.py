@@ -24,6 +24,7 @@ from simtest.rendering.frames import HighlightPoint, Radiance
 from simtest.rendering.misfits import crossed, exact_misfit
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
 from simtest.spec.lights import is_at_camera
+from simtest.spec.reflectance import TissueReflectance
 
 if TYPE_CHECKING:
     from simtest.rendering.session import Session
@@ -313,35 +314,42 @@ def _is_lit(session: "Session", positions: Array, lights: IntArray) -> Mask:
     return lit
 
 
-def radii_px(session: "Session", highlights: Sequence[HighlightPoint], half_width: float) -> Array:
+def radii_px(session: "Session", highlights: Sequence[HighlightPoint]) -> Array:
     """Compute the radii, shape (N,), px, at which highlights fall to half height, from their shape alone (theory 7.3).
 
-    The half-angle grows from the BP by the misfit's derivative J: a lobe of half-width `half_width`, rad, at half
-    height covers pi half_width^2 / abs(det J) px^2; the radius is that of the circle of this area. Relief that is not
-    resolved widens the lobe by its slopes, and a source by its size (theory 7.6), as if the lobe were Gaussian.
+    The half-angle grows from the BP by the misfit's derivative J: a lobe of half-width w, rad, at half height covers
+    pi w^2 / abs(det J) px^2; the radius is that of the circle of this area. The width is that of the place, wet or dry.
+    Relief that is not resolved widens the lobe by its slopes, and a source by its size (theory 7.6), as if the lobe
+    were Gaussian.
     """
     radii = np.full(len(highlights), np.nan)
     relief, rig, resolved = session.scene.surface.relief, session.scene.rig, not session.is_unresolved
+    reflectance, fine = session.scene.reflectance, session.surface.relief
+    own = [reflectance.half_width] * len(highlights)
+    if isinstance(reflectance, TissueReflectance) and reflectance.film.patches is not None and highlights:
+        assert fine is not None
+        wet = fine.wet(session.to_model(np.array([highlight.position for highlight in highlights])))
+        own = [reflectance.film.half_width(share) for share in wet.tolist()]
     if relief is not None and not resolved:
-        half_width = math.hypot(half_width, HALF_WIDTH * math.radians(relief.slope_deg))
+        own = [math.hypot(width, HALF_WIDTH * math.radians(relief.slope_deg)) for width in own]
     for index, (light, place) in enumerate(zip(rig.lights, rig.true_mm(), strict=True)):
         of_light = [i for i, highlight in enumerate(highlights) if highlight.light == index]
         if of_light:
             state = exact_misfit(session, np.array([highlights[i].bp_px for i in of_light]), place, fine=resolved)
-            widths = np.full(len(of_light), half_width)
+            widths = np.array(own)[of_light]
             if light.source is not None:
                 # The disc of the source's area, as the highlight points see it; the half-angle turns half as far.
                 away = np.array([highlights[i].position for i in of_light]) - place
                 reach = np.linalg.norm(away, axis=1)
                 seen = light.source.area_mm2 / np.pi * np.abs(away @ light.axis) / reach
-                widths = widened(half_width, np.sqrt(seen) / (2 * reach))
+                widths = widened(widths, np.sqrt(seen) / (2 * reach))
             with np.errstate(divide="ignore"):
                 radii[of_light] = widths / np.sqrt(np.abs(np.linalg.det(state.jacobian)))
     return radii
 
 
-def widened(half_width: float, disc: Array) -> Array:
-    """Return the half-widths at half height of a Gaussian lobe of one, convolved with discs of radii of shape (N,)."""
+def widened(half_width: Array | float, disc: Array) -> Array:
+    """Return the half-widths at half height of Gaussian lobes of some, convolved with discs of radii of shape (N,)."""
     sigma = half_width / HALF_WIDTH
     return np.asarray(np.where(disc > RATIOS[-1] * sigma, disc, sigma * np.interp(disc / sigma, RATIOS, _widths())))
 

@@ -9,7 +9,7 @@ from simtest.rendering.backend import dr, mi
 from simtest.rendering.elements.lights import LightPose, factor, kind_of, parameters, point
 from simtest.rendering.kernel_values import channel_mean
 from simtest.rendering.rays import Hit, Lanes
-from simtest.rendering.tissue_kernels import AlbedoKernel
+from simtest.rendering.tissue_kernels import AlbedoKernel, ReliefKernel
 from simtest.spec.lights import Rig, is_at_camera
 
 DRAWN = 4
@@ -98,19 +98,25 @@ class Material:
     base: Any
     # Of tissue, whose BSDF has an `albedo_at`; None where the albedo is the BSDF's own
     albedo: AlbedoKernel | None = None
+    film: ReliefKernel | None = None  # Whose film is patchy; None where the roughness is the BSDF's own
 
     @contextmanager
     def painted(self, hit: Hit) -> Iterator[None]:
-        """Let the base have the albedo of tissue at a hit, computed once for all lights; else its own."""
-        if self.albedo is None:
-            yield
-            return
-        albedo, before = self.albedo.of(hit.base, hit.base.is_valid()), self.bsdf.albedo_at
-        self.bsdf.albedo_at = lambda si, active: albedo
+        """Let the BSDF have albedo and roughness of tissue at a hit, computed once for all lights; else its own."""
+        found: dict[str, Any] = {}
+        if self.albedo is not None:
+            found["albedo_at"] = self.albedo.of(hit.base, hit.base.is_valid())
+        if self.film is not None:
+            assert hit.jets is not None
+            found["wet_at"] = self.film.wet(hit.jets.gain)
+        before = {name: getattr(self.bsdf, name) for name in found}
+        for name, value in found.items():
+            setattr(self.bsdf, name, lambda si, active, value=value: value)
         try:
             yield
         finally:
-            self.bsdf.albedo_at = before
+            for name, value in before.items():
+                setattr(self.bsdf, name, value)
 
     def parts(self, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
         """Compute f cos(theta) of the lobe and of the base."""

@@ -131,7 +131,7 @@ class Session:
     def _load_surface(self, scene: Scene) -> None:
         # A malformed surface raises here, and the session stays at its scene.
         moment = scene.deformation, scene.time_s
-        surface = make_surface(scene.surface, scene.film_level, scene.camera.moved, *moment)
+        surface = make_surface(scene.surface, scene.film_level, scene.camera.moved, *moment, scene.film_patches)
         check_camera(scene, surface)
         check_lights(scene, surface)
         check_motion(scene, surface)
@@ -139,6 +139,7 @@ class Session:
         # Relief and colour are looked up where the tissue is at rest.
         self._rest = RestMap(surface) if isinstance(surface, DeformedSurface) else None
         self._relief = None if surface.relief is None else ReliefKernel(surface.relief, self._rest)
+        self._film = self._relief if self._relief is not None and self._relief.is_patchy else None
         self.surface: SurfaceModel = surface
         self._set_tissue(scene)
         self.scene = scene
@@ -187,7 +188,7 @@ class Session:
             self._albedo = AlbedoKernel(self._pattern) if self._pattern else None
         if self._albedo is not None:
             self._albedo.rest = self._rest
-            self._built.let_bounces_find(self._albedo)
+        self._built.let_bounces_find(self._albedo, self._film)
 
     def _place_lights(self, model_from_camera: Array) -> None:
         self._light = self._built.place_lights(self.scene.rig, model_from_camera)
@@ -285,7 +286,7 @@ class Session:
     def _tracer(self, sightlines: Sightlines | None = None) -> Tracer:
         """Return what traces the scene, by default from the camera's own pose."""
         built, sightlines = self._built, sightlines or self.sightlines
-        material = Material(built.scene.shapes()[0].bsdf(), built.base, self._albedo)
+        material = Material(built.scene.shapes()[0].bsdf(), built.base, self._albedo, self._film)
         refinement = HitRefinement(self._shape)
         kernel = self._instruments
         return Tracer(built.scene, sightlines, self._light, material, refinement, self._relief, kernel)

@@ -37,6 +37,7 @@ class KernelJets:
     gradient: Any
     diffused: Any
     hessian: tuple[Any, ...] | None  # xx, xy, xz, yy, yz, zz of the former, 1/mm; None where not asked for
+    gain: Any = None  # What the film's level gains in patches, mm; None where it is constant
 
 
 @dataclass(frozen=True)
@@ -62,13 +63,24 @@ class ReliefKernel:
             for band in field.bands
         ]
         self._pool = None if field.level is None else (mi.Float(field.level), mi.Float(field.meniscus))
+        self._patches, self._wetting = None, None
+        if field.patches is not None:
+            lattice = mi.Matrix3f(field.patches.lattice_from_model.tolist())
+            self._patches = _Band(lattice, _stored(field.patches.coefficients), None)
+            self._wetting = mi.Float(field.wetting[0]), mi.Float(field.wetting[1])
         # Opaque, so that another relief of as many bands compiles no new kernel.
-        dr.make_opaque([band.lattice for band in self._bands], self._pool)
+        bands = [*self._bands, *([self._patches] if self._patches else [])]
+        dr.make_opaque([band.lattice for band in bands], self._pool, self._wetting)
 
     @property
-    def key(self) -> tuple[tuple[bool, ...], bool]:
-        """What of the relief is compiled into the kernel: each band, whether diffuse light sees it; and a film."""
-        return tuple(band.diffused is not None for band in self._bands), self._pool is not None
+    def key(self) -> tuple[tuple[bool, ...], bool, bool]:
+        """What of the relief is compiled into the kernel: of each band whether diffuse light sees it, film, patches."""
+        return tuple(band.diffused is not None for band in self._bands), self._pool is not None, self.is_patchy
+
+    @property
+    def is_patchy(self) -> bool:
+        """Whether the film's level varies over the surface, and with it the roughness."""
+        return self._patches is not None
 
     def jets_at(self, si: Any, bent: bool = False) -> KernelJets:
         """Compute the jets at surface points, mitsuba.SurfaceInteraction3f, as `jets` does."""
@@ -88,23 +100,50 @@ class ReliefKernel:
             diffused += own.diffused
             if own.hessian is not None:
                 hessian = [total + part for total, part in zip(hessian, own.hessian, strict=True)]
-        return self._fill(KernelJets(height, gradient, diffused, tuple(hessian) if bent else None))
+        patches = None if self._patches is None else _band(self._patches, mi.Vector3f(p), active, bent)
+        return self._fill(KernelJets(height, gradient, diffused, tuple(hessian) if bent else None), patches)
 
     def pool(self, jets: KernelJets) -> Any:
         """Return at which lanes a film fills a valley, mitsuba.Bool."""
-        return mi.Bool(False) if self._pool is None else jets.height < self._pool[0]
+        if self._pool is None:
+            return mi.Bool(False)
+        return (jets.height if jets.gain is None else jets.height - jets.gain) < self._pool[0]
 
-    def _fill(self, jets: KernelJets) -> KernelJets:
+    def wet(self, gain: Any) -> Any:
+        """Return the share by which ground is wet, as `ReliefField.wet` does, where the film's level gains so much."""
+        assert self._wetting is not None
+        level, width = self._wetting
+        return dr.rcp(1 + dr.exp((level - gain) / width))
+
+    def wet_at(self, si: Any, active: Any) -> Any:
+        """Return the share by which ground is wet at surface points, mitsuba.SurfaceInteraction3f."""
+        assert self._patches is not None
+        p = si.p if self._rest is None else self._rest.point(si, active)
+        return self.wet(_band(self._patches, mi.Vector3f(p), active, False).height)
+
+    def _fill(self, jets: KernelJets, patches: KernelJets | None) -> KernelJets:
         """Fill valleys as `ReliefField.fill` does."""
         if self._pool is None:
             return jets
         level, meniscus = self._pool
-        share = dr.rcp(1 + dr.exp(-dr.clip((jets.height - level) / meniscus, -60, 60)))
-        hessian = jets.hessian
+        height, g, hessian = jets.height, jets.gradient, jets.hessian
+        if patches is not None:
+            height, g, hessian = height - patches.height, g - patches.gradient, _added(hessian, patches.hessian, -1)
+        share = dr.rcp(1 + dr.exp(-dr.clip((height - level) / meniscus, -60, 60)))
         if hessian is not None:
-            bend, g = share * (1 - share) / meniscus, jets.gradient
+            bend = share * (1 - share) / meniscus
             hessian = tuple(share * h + bend * (g[i] * g[j]) for h, (i, j) in zip(hessian, UPPER, strict=True))
-        return KernelJets(jets.height, share * jets.gradient, jets.diffused, hessian)
+        if patches is None:
+            return KernelJets(jets.height, share * g, jets.diffused, hessian)
+        hessian = _added(hessian, patches.hessian, 1)
+        return KernelJets(jets.height, share * g + patches.gradient, jets.diffused, hessian, patches.height)
+
+
+def _added(hessian: tuple[Any, ...] | None, other: tuple[Any, ...] | None, sign: int) -> tuple[Any, ...] | None:
+    """Return the sum of two Hessians, of which neither or both were asked for, or their difference."""
+    if hessian is None or other is None:
+        return None
+    return tuple(h + sign * own for h, own in zip(hessian, other, strict=True))
 
 
 def turned(si: Any, gradient: Any) -> Any:
@@ -347,7 +386,7 @@ class RestMap:
             xx, xy, xz, yy, yz, zz = upper
             whole = K @ mi.Matrix3f(xx, xy, xz, xy, yy, yz, xz, yz, zz) @ K.T
             hessian = tuple(whole[i, j] for i, j in UPPER)
-        return KernelJets(jets.height, gradient, K @ jets.diffused, hessian)
+        return KernelJets(jets.height, gradient, K @ jets.diffused, hessian, jets.gain)
 
     def _numbers(self, si: Any, active: Any, first: int, last: int) -> list[Any]:
         """Interpolate numbers of the vertices' rows between the corners of the hit triangle."""

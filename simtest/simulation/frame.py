@@ -329,7 +329,7 @@ def _placed(
     session: Session, radiance: Radiance, highlights: list[TrueHighlight]
 ) -> tuple[list[TrueHighlight], Sequence[HighlightPoint]]:
     """Return highlights with their radii and the numbers of their clouds, and the clouds' centres."""
-    radii = radii_px(session, highlights, session.scene.reflectance.half_width)
+    radii = radii_px(session, highlights)
     if session.surface.relief is None:
         placed = [replace(h, radius_px=float(radii[i]), cloud=i) for i, h in enumerate(highlights)]
         return placed, placed

@@ -336,6 +336,21 @@ class RoughConductorReflectance(_Reflectance):
         return ggx_half_width(self.alpha)
 
 
+class Patches(Spec):
+    """Patches of deep and shallow film with dry ground between: the film's level is a random field over the surface."""
+
+    wavelength_mm: float = Field(
+        12.0, ge=1, le=20, description="mean wavelength of the level, mm; a patch is about half as wide"
+    )
+    amplitude: float = Field(
+        2.0, gt=0, le=10, description="standard deviation of the level, in those of the relief's height"
+    )
+    dry_level: float = Field(
+        -1.5, ge=-30, le=3, description="ground is dry where the level is lower, in deviations as the level itself"
+    )
+    dry_alpha: float = Field(0.3, ge=0.05, le=0.5, description="roughness of dry ground, in place of alpha")
+
+
 class Film(Spec):
     """A liquid film over the tissue: a rough dielectric surface."""
 
@@ -349,6 +364,23 @@ class Film(Spec):
         description="height up to which the film fills the valleys of surface.relief, in standard deviations of the "
         "relief's height about its mean; default: the film follows the relief",
     )
+    patches: Patches | None = Field(
+        None, description="how the level varies over the surface about `level`; default: it does not"
+    )
+
+    @model_validator(mode="after")
+    def _has_level(self) -> "Film":
+        if self.patches is not None and self.level is None:
+            raise ValueError("patches vary the film's level: give level too, or leave out patches")
+        return self
+
+    def half_width(self, wet: float = 1.0) -> float:
+        """Return the half-angle at which the lobe falls to half, rad, where ground is wet by a share.
+
+        Beckmann's exp(-tan^2/alpha^2), or `ggx_half_width`.
+        """
+        alpha = self.alpha if self.patches is None else wet * self.alpha + (1 - wet) * self.patches.dry_alpha
+        return math.atan(alpha * math.sqrt(math.log(2))) if self.distribution == "beckmann" else ggx_half_width(alpha)
 
 
 class TissueReflectance(_Painted):
@@ -366,35 +398,40 @@ class TissueReflectance(_Painted):
     @property
     def compiled(self) -> tuple[object, ...]:
         """What of the reflectance is compiled into the kernels."""
-        return self.type, self.film.distribution
+        return self.type, self.film.distribution, self.film.patches is not None
 
     @property
     def kernel(self) -> KernelTable:
         """Description for `mitsuba.load_dict`."""
-        film = self.film.model_dump(include={"alpha", "index", "distribution"})
+        film = {"distribution": self.film.distribution, **self._film}
         return {"type": "simtest_tissue", **film, "diffuse_reflectance": _rgb(self._base)}
 
     @property
     def updates(self) -> KernelTable:
         """Values that change without a rebuild."""
-        return {"alpha": self.film.alpha, "index": self.film.index, "diffuse_reflectance.value": self._base}
+        return {**self._film, "diffuse_reflectance.value": self._base}
+
+    @property
+    def _film(self) -> KernelTable:
+        dry = {} if self.film.patches is None else {"dry_alpha": self.film.patches.dry_alpha}
+        return {"alpha": self.film.alpha, "index": self.film.index, **dry}
 
     @property
     def lobe_curvature(self) -> float | None:
-        """Curvature -(log f)''(0) of the lobe with the light at the camera; None for GGX, whose tails it misses.
+        """Curvature -(log f)''(0) of the lobe with the light at the camera.
+
+        None for GGX, whose tails it misses, and where dry ground has another lobe.
 
         Beckmann: f cos(theta) is proportional to exp(-tan^2(theta)/alpha^2) / cos^5(theta), so 2/alpha^2 - 5. Smith's
         function is 1 next to the normal, and the facets that reflect back are met straight on.
         """
-        return 2 / self.film.alpha**2 - 5 if self.film.distribution == "beckmann" else None
+        is_one = self.film.distribution == "beckmann" and self.film.patches is None
+        return 2 / self.film.alpha**2 - 5 if is_one else None
 
     @property
     def half_width(self) -> float:
-        """Half-angle at which the lobe falls to half, rad: Beckmann's exp(-tan^2/alpha^2), or `ggx_half_width`."""
-        alpha = self.film.alpha
-        return (
-            math.atan(alpha * math.sqrt(math.log(2))) if self.film.distribution == "beckmann" else ggx_half_width(alpha)
-        )
+        """Half-angle at which the lobe of wet ground falls to half, rad."""
+        return self.film.half_width()
 
 
 Reflectance = Annotated[

@@ -18,7 +18,14 @@ from simtest.spec.camera import SceneCamera, Views
 from simtest.spec.camera_formats.common import read_json
 from simtest.spec.keys import replace_values
 from simtest.spec.lights import Rig
-from simtest.spec.reflectance import PhongReflectance, Reflectance, TissueColour, TissueReflectance, Translucency
+from simtest.spec.reflectance import (
+    Patches,
+    PhongReflectance,
+    Reflectance,
+    TissueColour,
+    TissueReflectance,
+    Translucency,
+)
 from simtest.spec.sensor import Sensor
 from simtest.spec.spec_model import Millimetres, Spec, validate
 from simtest.spec.surfaces import MOST_DEFORMATIONS, Deformation, Instrument, Surface
@@ -103,12 +110,17 @@ class Scene(Spec):
     @property
     def placement(self) -> tuple[object, ...]:
         """What determines the surface and the camera's place before it."""
-        return self.surface, self.film_level, self.camera.moved, self.deformation, self.time_s
+        return self.surface, self.film_level, self.film_patches, self.camera.moved, self.deformation, self.time_s
 
     @property
     def film_level(self) -> float | None:
         """Up to where a liquid film fills the valleys of the relief, in standard deviations of its height."""
         return self.reflectance.film.level if isinstance(self.reflectance, TissueReflectance) else None
+
+    @property
+    def film_patches(self) -> Patches | None:
+        """How that level varies over the surface; None where it does not."""
+        return self.reflectance.film.patches if isinstance(self.reflectance, TissueReflectance) else None
 
     @property
     def translucency(self) -> Translucency | None:
@@ -151,6 +163,8 @@ class Scene(Spec):
                 dumped.pop(name, None)
         if self.camera.moved is None:
             dumped.get("camera", {}).pop("moved", None)
+        if self.film_patches is None:
+            dumped.get("reflectance", {}).get("film", {}).pop("patches", None)
         return dumped
 
     @property

@@ -28,7 +28,7 @@ from simtest.surfaces.model import (
     pack_points,
     shape_operator,
 )
-from simtest.surfaces.relief_field import ReliefField
+from simtest.surfaces.relief_field import BandField, ReliefField
 
 CONVERGED_MM = 1e-12
 """Residual at which the inverse is found; rounding ends the steps earlier for coordinates of 1000 mm and more."""
@@ -250,11 +250,11 @@ class DeformedRelief(ReliefField):
 
     deformation: DeformationAt | None = None  # The moment's deformation of the model frame
 
-    def tissue_jets(self, points: Array, diffused: bool = False) -> Jet:
-        """Compute the jets of the tissue below the film at deformed points, shape (N, 3), model frame, mm."""
+    def _summed(self, bands: tuple[BandField, ...], points: Array, diffused: bool = False) -> Jet:
+        """Compute the jets of the sum of bands at deformed points, shape (N, 3), model frame, mm."""
         assert self.deformation is not None
         rest = self.deformation.at_rest(points)
-        at_rest = super().tissue_jets(rest, diffused)
+        at_rest = super()._summed(bands, rest, diffused)
         return Jet(at_rest.value, *carry(self.deformation.jets(rest), at_rest.gradient, at_rest.hessian))
 
 
@@ -293,7 +293,8 @@ class DeformedSurface(SurfaceModel):
         self.model_from_camera = rest.model_from_camera
         self._rest_mesh = mesh
         if rest.relief is not None:
-            parts = {name: getattr(rest.relief, name) for name in ("bands", "deviation", "level")}
+            names = ("bands", "deviation", "level", "patches", "dry_level")
+            parts = {name: getattr(rest.relief, name) for name in names}
             # Where tissue is compressed its waves are shorter.
             shortest = float(np.linalg.svd(self.vertex_jets.gradient, compute_uv=False).min())
             wave = rest.relief.finest_wave * min(1.0, shortest)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
 from simtest.spec.camera import Moved
+from simtest.spec.reflectance import Patches
 from simtest.spec.surfaces import (
     AnatomySurface,
     CylinderSurface,
@@ -39,6 +40,7 @@ def make_surface(
     moved: Moved | None = None,
     deformation: Sequence[Deformation] = (),
     time_s: float = 0.0,
+    film_patches: Patches | None = None,
 ) -> SurfaceModel:
     """Make the model of a scene's surface.
 
@@ -54,6 +56,8 @@ def make_surface(
         How it deforms; the camera is not moved with it.
     time_s : float
         The moment of the deformation, s.
+    film_patches : Patches, optional
+        How the film's level varies over the surface.
     """
     surface: SurfaceModel = _make_anatomy(spec) if isinstance(spec, AnatomySurface) else ANALYTIC[type(spec)](spec)
     if isinstance(spec, AnatomySurface) and spec.view != "auto":
@@ -67,7 +71,7 @@ def make_surface(
         # Imported here: its filters are slow to load, and smooth scenes do not need them.
         from simtest.surfaces.relief_field import make_relief
 
-        surface.relief = make_relief(spec.relief, film_level)
+        surface.relief = make_relief(spec.relief, film_level, film_patches)
     if deformation:
         # Imported here, as the relief above.
         from simtest.surfaces.deformation import DeformationAt, DeformedSurface

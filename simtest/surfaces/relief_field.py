@@ -6,6 +6,7 @@ The lattice fills space, so the field has no seams on any surface, and is statio
 
 The relief turns the normal and leaves the position: the fine normal at the base point P is N - grad h, normalised, with
 the gradient along the surface. A film may fill the valleys up to a level: pools are smooth, crests keep their relief.
+The level itself may be such a field, of long waves: patches of deep film, and of dry ground where it is low.
 """
 
 from collections.abc import Callable
@@ -17,6 +18,7 @@ import numpy as np
 
 from simtest.geometry.vectors import projector, tangent_basis, unit
 from simtest.runtime.arrays import AnyArray, Array, kept
+from simtest.spec.reflectance import Patches
 from simtest.spec.surfaces import Relief, ReliefBand
 from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import SurfacePoints, in_rows, outer, principal, remembered, shape_operator
@@ -50,6 +52,15 @@ FELT = 0.1
 
 MENISCUS = 0.1
 """Width of a pool's rim, where the film's surface bends from the pool to the crest, in deviations of the height."""
+
+DRYING = 0.5
+"""Width of the rim of dry ground, where its roughness changes to the film's, in deviations of the height."""
+
+PATCH_WIDTH = 0.5
+"""Relative width of the band of wave numbers of the film's level: patches of many sizes."""
+
+PATCH_BRANCH = 4
+"""Of the relief's seed: its bands, at most four, have the branches before."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +117,8 @@ class ReliefField:
     deviation: float  # Standard deviation of the height, mm
     finest_wave: float  # Least wavelength of the bands that hold a share of the slope above `FELT`, mm
     level: float | None = None  # Height up to which a film fills the valleys, mm; None: it follows the relief
+    patches: BandField | None = None  # What the level gains from place to place, mm; None: nothing
+    dry_level: float = -np.inf  # Ground is dry where the level is below this, mm
 
     @property
     def meniscus(self) -> float:
@@ -114,24 +127,51 @@ class ReliefField:
 
     def tissue_jets(self, points: Array, diffused: bool = False) -> Jet:
         """Compute the jets of the tissue below the film at points, shape (N, 3), model frame, mm."""
+        return self._summed(self.bands, points, diffused)
+
+    def patch_jets(self, points: Array) -> Jet | None:
+        """Compute the jets of what the film's level gains at points, shape (N, 3), mm; None where it is constant."""
+        return None if self.patches is None else self._summed((self.patches,), points)
+
+    @property
+    def wetting(self) -> tuple[float, float]:
+        """What the film's level gains where ground is half wet, mm, and over which width it dries."""
+        assert self.level is not None
+        return self.dry_level - self.level, DRYING * self.deviation
+
+    def wet(self, points: Array) -> Array:
+        """Compute the share by which ground is wet at points, shape (N, 3), model frame, mm."""
+        patches = self.patch_jets(points)
+        if patches is None:
+            return np.ones(len(points))
+        level, width = self.wetting
+        return np.asarray(1 / (1 + np.exp((level - patches.value) / width)))
+
+    def _summed(self, bands: tuple[BandField, ...], points: Array, diffused: bool = False) -> Jet:
+        """Compute the jets of the sum of bands."""
         parts = [
-            reduce(Jet.__add__, [band.jets(some, diffused) for band in self.bands])
+            reduce(Jet.__add__, [band.jets(some, diffused) for band in bands])
             for some in np.split(points, range(POINTS, len(points), POINTS))
         ]
         return Jet(*(np.concatenate(blocks) for blocks in zip(*(jet.parts for jet in parts), strict=True)))
 
     def jets(self, points: Array) -> Jet:
         """Compute the jets of the surface that the film's reflection sees, at points, shape (N, 3), model frame, mm."""
-        return self.fill(self.tissue_jets(points))
+        return self.fill(self.tissue_jets(points), self.patch_jets(points))
 
-    def fill(self, jets: Jet) -> Jet:
-        """Fill valleys: phi(h) = level + w log(1 + exp((h - level)/w)), with w the meniscus; and its derivatives."""
+    def fill(self, tissue: Jet, patches: Jet | None = None) -> Jet:
+        """Fill valleys: phi(h) = level + w log(1 + exp((h - level)/w)), with w the meniscus; and its derivatives.
+
+        With patches the level is that of the field and what these gain on it.
+        """
         if self.level is None:
-            return jets
-        x = (jets.value - self.level) / self.meniscus
+            return tissue
+        above = tissue if patches is None else tissue + patches.affine(-1.0)
+        x = (above.value - self.level) / self.meniscus
         share = 1 / (1 + np.exp(-np.clip(x, -60.0, 60.0)))
         bend = share * (1 - share) / self.meniscus
-        return jets.chain(self.level + self.meniscus * np.logaddexp(0.0, x), share, bend)
+        filled = above.chain(self.level + self.meniscus * np.logaddexp(0.0, x), share, bend)
+        return filled if patches is None else filled + patches
 
     def apply(self, points: SurfacePoints) -> SurfacePoints:
         """Turn the normals and curvatures of base points, model frame, to those of the fine surface.
@@ -143,12 +183,14 @@ class ReliefField:
         valid = np.flatnonzero(points.valid)
         if not len(valid):
             return points
-        tissue = self.tissue_jets(points.position[valid])
-        fine = fine_curvatures(points.normal[valid], shape_operator(points)[valid], self.fill(tissue))
+        position = points.position[valid]
+        tissue, patches = self.tissue_jets(position), self.patch_jets(position)
+        fine = fine_curvatures(points.normal[valid], shape_operator(points)[valid], self.fill(tissue, patches))
         names = ("normal", "k_min", "k_max", "direction_min", "direction_max")
         changed: dict[str, Any] = dict(zip(names, in_rows(len(points.valid), valid, *fine), strict=True))
         pool = np.zeros(len(points.valid), dtype=bool)
-        pool[valid] = False if self.level is None else tissue.value < self.level
+        if self.level is not None:
+            pool[valid] = (tissue if patches is None else tissue + patches.affine(-1.0)).value < self.level
         return replace(points, **changed, pool=pool)
 
 
@@ -180,10 +222,28 @@ def fine_curvatures(N: Array, S: Array, jets: Jet) -> tuple[Array, ...]:
 # Making the field ------------------------------------------------------------------------------------------------
 
 
-def make_relief(spec: Relief, level: float | None = None) -> ReliefField:
-    """Make the relief of a description; a film fills its valleys up to `level` deviations of the height."""
+def make_relief(spec: Relief, level: float | None = None, patches: Patches | None = None) -> ReliefField:
+    """Make the relief of a description; a film fills its valleys up to `level` deviations of the height.
+
+    With patches the level varies about that.
+    """
     field = _make_field(spec)
-    return field if level is None else replace(field, level=level * field.deviation)
+    if level is None:
+        return field
+    field = replace(field, level=level * field.deviation)
+    if patches is None:
+        return field
+    # A relief of its own, of any slope: it is scaled to the deviation.
+    seed = int(np.random.SeedSequence(spec.seed, spawn_key=(PATCH_BRANCH,)).generate_state(1)[0])
+    waves = ReliefBand(slope_deg=1.0, wavelength_mm=patches.wavelength_mm, width=PATCH_WIDTH)
+    own = _make_field(Relief(bands=(waves,), seed=seed))
+    scale = patches.amplitude * field.deviation / own.deviation
+    return replace(
+        field,
+        patches=replace(own.bands[0], coefficients=scale * own.bands[0].coefficients),
+        dry_level=patches.dry_level * field.deviation,
+        finest_wave=min(field.finest_wave, own.finest_wave),
+    )
 
 
 @remembered

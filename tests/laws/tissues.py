@@ -32,7 +32,8 @@ def relief(session: Session) -> list[Law]:
         law("relief", "slope", "x", slope / SLOPE_DEG, 1.04, 0.96, POINTS, about),
         law("relief", "wavelength", "x", wave / WAVE_MM, 1.04, 0.96, POINTS, about),
         law("relief", "slope_of_two", "x", both / math.hypot(SLOPE_DEG, 4.0), 1.04, 0.96, POINTS, about),
-        _fine_normals(session),
+        _fine_normals(session, "normal_off", {}),
+        _fine_normals(session, "patches_normal_off", {"level": -0.5, "patches": {"wavelength_mm": 4.0}}),
     ]
 
 
@@ -59,14 +60,16 @@ def _section(described: dict[str, Any]) -> tuple[float, float]:
     return math.degrees(math.atan(math.sqrt(m2 / 2))), 2 * math.pi * math.sqrt(m2 / m4)
 
 
-def _fine_normals(session: Session) -> Law:
-    """Compare the true fine normals of a plane with differences of the height along it."""
+def _fine_normals(session: Session, quantity: str, film: dict[str, Any]) -> Law:
+    """Compare the true fine normals of a plane with differences of the height along it, that of the film in pools."""
     camera = {"width": 40, "height": 40, "fx": 60.0, "fy": 60.0, "cx": 20.0, "cy": 20.0}
     surface = {"type": "plane", "distance_mm": 10.0, "relief": RELIEF}
-    session.update(scene_from_dict({"surface": surface, "camera": camera}, "law"))
-    truth, field = session.truth(), make_relief(Relief.model_validate(RELIEF))
+    wet = {"type": "tissue", "film": {"index": 1.34, **film}}
+    session.update(scene_from_dict({"surface": surface, "camera": camera, "reflectance": wet}, "law"))
+    spec = session.scene
+    truth, field = session.truth(), make_relief(Relief.model_validate(RELIEF), spec.film_level, spec.film_patches)
     points = truth.position[truth.mask]
-    step = 1e-3
+    step = 2e-4
 
     def slope(axis: Array) -> Array:
         return (field.jets(session.to_model(points + step * axis)).value
@@ -76,8 +79,8 @@ def _fine_normals(session: Session) -> Law:
     # Height counts towards the camera, along -z: where it rises the normal leans back.
     normal = np.stack([-x, -y, -np.ones_like(x)], axis=-1)
     off = by_hand.angle_deg(truth.normal[truth.mask], normal).max()
-    about = "a rise of the height turns the normal away from it; differences of 1e-3 mm"
-    return law("relief", "normal_off", "deg", float(off), 1e-3, n=len(points), about=about)
+    about = "a rise of the height turns the normal away from it; differences of 2e-4 mm"
+    return law("relief", quantity, "deg", float(off), 1e-3, n=len(points), about=about)
 
 
 def translucency() -> list[Law]:

@@ -68,6 +68,7 @@ SCENES = {
     "too many calibres": (VESSELS + "smallest_mm = 0.01", "more than the smallest and at most 30 times"),
     "vessels too near": (VESSELS + "spacing_mm = 0.3", "vessels must not be wider than their spacing"),
     "level without relief": (WET + "level = 0.5", "reflectance.film.level = 0.5: there are no valleys to fill"),
+    "patches without level": (WET + "patches = {}", "patches vary the film's level: give level too"),
     # Lights
     "placed twice": (LIGHT + "position_mm = [1, 0, 0]\noffset_mm = 1", "position_mm and offset_mm exclude each"),
     "preset and lights": (RIG + 'preset = "colocated"\nlights = [{}]', "preset and lights exclude each other"),

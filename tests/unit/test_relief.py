@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from surface_helpers import RELIEF, STENCIL, curvatures, derivative, normals, relative
+from scipy.stats import norm
+from surface_helpers import RELIEF, STENCIL, curvatures, derivative, gradient, normals, relative
 
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
+from simtest.spec.reflectance import Patches
 from simtest.spec.surfaces import MAX_HEIGHT_MM, Relief
 from simtest.surfaces import forget_meshes
 from simtest.surfaces.jets import Jet
@@ -229,6 +231,42 @@ def test_film_fills_valleys_smoothly(height, level, gradient):
     share, bend = (derivative(lambda k, n=n: near(k).parts[n], 1e-6) for n in (0, 1))
     assert np.allclose(filled.gradient, share[:, None] * G, atol=1e-8)
     assert np.allclose(filled.hessian[0], np.outer(bend[0], G[0]), atol=1e-5 * (1 + np.abs(filled.hessian).max()))
+
+
+PATCHES = Patches(wavelength_mm=4.0, amplitude=1.5, dry_level=-0.5)
+
+
+def test_patches_are_a_smooth_level_of_the_given_deviation_and_wavelength():
+    spec = Relief(bands=(BAND,), seed=2)
+    field, plain = make_relief(spec, -0.2, PATCHES), make_relief(spec, -0.2)
+    np.testing.assert_array_equal(field.bands[0].coefficients, plain.bands[0].coefficients)
+    x = np.random.default_rng(8).uniform(-150, 150, (20_000, 3))
+    gain, tissue = field.patch_jets(x), field.tissue_jets(x)
+    assert gain.value.std() == pytest.approx(1.5 * field.deviation, rel=0.06)
+    assert abs(gain.value.mean()) < 0.15 * field.deviation
+    # Another draw than the relief's own
+    assert abs(np.corrcoef(gain.value, tissue.value)[0, 1]) < 0.05
+    slope, bend = gain.gradient[:, :2], gain.hessian[:, 0, 0] + gain.hessian[:, 1, 1]
+    wave = 2 * np.pi * np.sqrt((slope**2).sum(axis=1).mean() / (bend**2).mean())
+    assert wave == pytest.approx(4.0, rel=0.06)
+    # Dry where the level is below its limit, and half dry there
+    level = -0.2 * field.deviation + gain.value
+    np.testing.assert_array_equal(field.wet(x) < 0.5, level < -0.5 * field.deviation)
+    assert (field.wet(x) < 0.5).mean() == pytest.approx(norm.cdf(-0.3 / 1.5), abs=0.05)
+    # Pools lie up to the local level: the surface is that of the tissue above it, and the level's below.
+    filled = field.jets(x).value
+    highest = np.maximum(tissue.value, level)
+    assert (filled >= highest - 1e-15).all()
+    assert (filled <= highest + np.log(2) * field.meniscus + 1e-15).all()
+
+
+def test_the_surface_of_patches_has_the_derivatives_of_its_height():
+    field = make_relief(Relief(bands=(BAND,), seed=2), -0.2, PATCHES)
+    x = np.random.default_rng(9).uniform(-20, 20, (400, 3))
+    jets = field.jets(x)
+    assert np.abs(gradient(lambda p: field.jets(p).value, x, 1e-4) - jets.gradient).max() < 1e-7
+    bent = gradient(lambda p: field.jets(p).gradient, x, 1e-4)
+    assert np.abs(bent - jets.hessian).max() < 1e-4 * np.abs(jets.hessian).max()
 
 
 def test_diffuse_light_sees_the_field_smoothed_in_space():

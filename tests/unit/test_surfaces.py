@@ -193,14 +193,21 @@ DEFORMATIONS = {"at rest": [], "breathing": [BREATH], "moved": [WAVE, BREATH, DE
 
 CASES = [(name, None, "at rest") for name in SURFACES]
 CASES += [(name, film, "at rest") for name, film in product(ON_RELIEF, ("bare", -0.5))]
+CASES += [(name, "patches", "at rest") for name in ("sphere", "colon")] + [("quadric", "patches", "moved")]
 CASES += [(name, None, "moved") for name in list(SURFACES)[:6]]
 CASES += [("sphere", None, "ringed"), ("quadric", "bare", "moved")]
 BREATHING = [(name, None, "breathing") for name in ("colon", "liver")]
 CASES += BREATHING
-"""Surface; without relief, with a bare one, or one under a film up to a level; and its deformation."""
+"""Surface; without relief, with a bare one, or one under a film up to a level or in patches; and its deformation."""
+PATCHY = {"type": "tissue", "film": {"index": 1.34, "level": -0.5, "patches": {"wavelength_mm": 5.0}}}
 DEAR = [(name, None, "at rest") for name in ("colon, polyps", "colon, tight")]
 DEAR += [("colon", "bare", "at rest"), ("liver", "bare", "at rest"), ("liver", -0.5, "at rest")]
-DEAR += [("sphere", None, "ringed"), ("quadric", "bare", "moved")]
+DEAR += [
+    ("sphere", None, "ringed"),
+    ("quadric", "bare", "moved"),
+    ("quadric", "patches", "moved"),
+    ("colon", "patches", "at rest"),
+]
 DEAR += [(name, None, "moved") for name in list(SURFACES)[:6] if name != "sphere inside"]
 
 
@@ -208,7 +215,8 @@ def scene(name, relief=None, deformation="at rest"):
     surface = SURFACES[name] | ({} if relief is None else {"relief": RELIEF})
     camera = {"width": 64, "height": 48, "fx": 50, "fy": 50}
     moment = {"deformation": DEFORMATIONS[deformation], "time_s": 0.7}
-    return scene_from_dict({"surface": surface, "camera": camera, **moment})
+    wet = {"reflectance": PATCHY} if relief == "patches" else {}
+    return scene_from_dict({"surface": surface, "camera": camera, **moment, **wet})
 
 
 @pytest.fixture(scope="module")
@@ -218,7 +226,7 @@ def session():
 
 def placed(session, name, relief, deformation="at rest"):
     session.update(scene(name, relief, deformation))
-    if relief not in (None, "bare"):
+    if isinstance(relief, float):
         session.surface.relief = make_relief(session.scene.surface.relief, relief)
     return session.surface
 

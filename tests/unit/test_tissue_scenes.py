@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from simtest.rendering import Session
+from simtest.simulation.frame import render_view
 from simtest.spec import scene_from_dict
 from tests.lobe_formulas import film_value
 
@@ -143,6 +144,67 @@ def test_pools_shine_as_a_smooth_film_does():
     np.testing.assert_allclose(filled.specular[bright], smooth.specular[bright], rtol=2e-3)
     assert np.abs(bare.specular[bright] / smooth.specular[bright] - 1).mean() > 0.3
     np.testing.assert_array_equal(filled.diffuse, bare.diffuse)
+
+
+# Patches of film ------------------------------------------------------------------------------------------------------
+
+FLAT = {"bands": [{"slope_deg": 1e-3, "wavelength_mm": 0.5}], "seed": 3}
+PATCHES = {"wavelength_mm": 1.5, "amplitude": 5.0, "dry_level": -0.3, "dry_alpha": 0.1}
+"""On a relief that turns no normal the film's level changes the roughness alone."""
+
+
+def test_wet_and_dry_ground_have_lobes_of_their_own_roughness():
+    """At each pixel of a plane the closed form of the roughness there, between the film's and that of dry ground."""
+    film = {"index": 1.36, "alpha": 0.05, "level": 0.0, "patches": PATCHES}
+    session = Session(scene(film, FLAT, diffuse=0.0))
+    rendered, truth = session.radiance().specular, session.truth()
+    wet = session.surface.relief.wet(session.to_model(truth.position.reshape(-1, 3))).reshape(SIZE, SIZE)
+    assert min((wet < 0.02).mean(), (wet > 0.98).mean()) > 0.1
+    alike = [plane_film(alpha, 1.36, 0.0, (0.0, 0.0, 0.0)) for alpha in (0.05, 0.1)]
+    expected = np.zeros_like(rendered)
+    for row, column in np.ndindex(SIZE, SIZE):
+        local = wet[row, column] * 0.05 + (1 - wet[row, column]) * 0.1
+        expected[row, column] = plane_film(local, 1.36, 0.0, (0.0, 0.0, 0.0))[row, column]
+    np.testing.assert_allclose(rendered, expected, rtol=2e-3)
+    for one in alike:
+        assert np.abs(rendered / one - 1).mean() > 0.1
+
+
+@pytest.mark.parametrize("depth", [2, 3])
+def test_ground_that_is_dry_everywhere_is_a_film_of_its_roughness(depth):
+    """Direct light and bounces in a tube; and radii of highlights. Another roughness is no other kernel."""
+    tube = {"type": "cylinder", "radius_mm": 20.0, "side": "inside"}
+
+    def described(**film):
+        tables = scene({"index": 1.36, "level": -3.0, **film}, FLAT, focal=WIDE, **tube).model_dump()
+        return scene_from_dict({**tables, "render": {"samples_per_pixel": 4, "path_depth": depth}})
+
+    session = Session(described(alpha=0.03, patches={**PATCHES, "amplitude": 1e-3, "dry_level": 3.0}))
+    rebuilds, rough = session.rebuilds, []
+    for alpha in (0.06, 0.1):
+        patches = {**PATCHES, "amplitude": 1e-3, "dry_level": 3.0, "dry_alpha": alpha}
+        session.update(described(alpha=0.03, patches=patches))
+        dry, film = render_view(session, session.scene), Session(described(alpha=alpha))
+        one = render_view(film, film.scene)
+        for part in ("specular", "diffuse", "indirect"):
+            found, expected = (getattr(view.radiance, part) for view in (dry, one))
+            np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * expected.max(), err_msg=part)
+        np.testing.assert_allclose(
+            [h.radius_px for h in dry.highlights], [h.radius_px for h in one.highlights], rtol=1e-3
+        )
+        rough.append(np.median([h.radius_px for h in dry.highlights]))
+    assert session.rebuilds == rebuilds
+    assert rough[1] > 1.5 * rough[0]
+    assert depth == 2 or dry.radiance.indirect.max() > 0
+
+
+def test_patches_say_nothing_where_there_are_none():
+    plain = scene({**FILM, "level": 0.5}, RELIEF)
+    assert "patches" not in plain.model_dump()["reflectance"]["film"]
+    assert plain.reflectance.lobe_curvature is not None
+    patchy = scene({**FILM, "level": 0.5, "patches": PATCHES}, RELIEF)
+    assert patchy.calibration().priors.lobe_curvature is None
+    assert scene_from_dict(patchy.model_dump()) == patchy
 
 
 def test_normals_that_face_away_give_no_light_and_no_nan():

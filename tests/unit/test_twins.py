@@ -11,7 +11,7 @@ from simtest.rendering.elements.lights import LightPose, factor, kind_of, parame
 from simtest.rendering.tissue_kernels import AlbedoKernel, ReliefKernel
 from simtest.spec import load_scene
 from simtest.spec.lights import LightSpec
-from simtest.spec.reflectance import TissueColour
+from simtest.spec.reflectance import Patches, TissueColour
 from simtest.spec.scene import scene_from_dict
 from simtest.spec.surfaces import Relief
 from simtest.surfaces import make_surface
@@ -50,10 +50,18 @@ def test_relief(mi, name):
 
     spec = KINDS if name == "all kinds" else load_scene(name).surface.relief
     lanes, points = in_kernel(mi.Point3f, np.random.default_rng(9).uniform(-40, 40, (COUNT, 3)))
-    for level in (None, 0.2):
-        field = make_relief(spec, level)
-        jets = ReliefKernel(field).jets(lanes, True, bent=True)
+    for level, patches in ((None, None), (0.2, None), (-0.2, Patches(wavelength_mm=4.0, dry_level=-1.0))):
+        field = make_relief(spec, level, patches)
+        kernel = ReliefKernel(field)
+        jets = kernel.jets(lanes, True, bent=True)
         dr.eval(jets.height, jets.gradient, jets.diffused, jets.hessian)
+        if patches is not None:
+            wet, pool = np.array(kernel.wet(jets.gain)), np.array(kernel.pool(jets))
+            assert np.abs(wet - field.wet(points)).max() < 1e-4
+            assert 0.1 < wet.mean() < 0.9
+            above = field.tissue_jets(points).value - field.level - field.patch_jets(points).value
+            clear = np.abs(above) > 1e-3 * field.deviation
+            np.testing.assert_array_equal(pool[clear], (above < 0)[clear])
         exact, diffused, tissue = (
             field.jets(points),
             field.tissue_jets(points, diffused=True),

@@ -11,7 +11,7 @@ MARGIN = 1 / 40
 """Share of the light through the film that is given up per unit of alpha.
 
 The film's rough surface reflects a little more than the smooth one, of which the light through it is taken: less than
-this in any direction for alpha up to 0.1 and an index from 1.33 to 1.40, so that no more is reflected than arrives.
+this in any direction for alpha up to 0.5 and an index from 1.33 to 1.40, so that no more is reflected than arrives.
 """
 
 
@@ -36,9 +36,14 @@ def _lift(bsdf: Any, albedo: Any) -> Any:
     return albedo / (1 - albedo * bsdf.returned)
 
 
-def _film(bsdf: Any, wi: Any, wo: Any) -> tuple[Any, Any]:
+def _alpha(bsdf: Any, si: Any, active: Any) -> Any:
+    """Return the roughness at surface points: the film's, or that of dry ground, as they are wet."""
+    return bsdf.alpha if bsdf.wet_at is None else dr.lerp(bsdf.dry_alpha, bsdf.alpha, bsdf.wet_at(si, active))
+
+
+def _film(bsdf: Any, wi: Any, wo: Any, alpha: Any) -> tuple[Any, Any]:
     """Compute f cos(theta) and the sampling density of the film's reflection, of directions above it."""
-    density, lobe, facing = reflected(wi, wo, bsdf.alpha, bsdf.ggx)
+    density, lobe, facing = reflected(wi, wo, alpha, bsdf.ggx)
     # Gradients must not flow through the choice of samples.
     return lobe * mi.fresnel(facing, bsdf.index)[0], dr.detach(density)
 
@@ -52,7 +57,7 @@ def _values(bsdf: Any, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, An
     share = bsdf._share(ctx, si, wi, active)
     glossy, diffuse = bsdf._enabled(ctx)
     if glossy:
-        film, drawn = bsdf._film(wi, wo)
+        film, drawn = bsdf._film(wi, wo, bsdf._alpha(si, active))
         value += film
         density += share * drawn
     if diffuse:
@@ -77,7 +82,7 @@ def _draw(bsdf: Any, ctx: Any, si: Any, sample2: Any, active: Any) -> tuple[Any,
     wi = dr.select(active, si.wi, mi.Vector3f(0, 0, 1))
     # The normals of the facets that are seen from the direction of incidence.
     kind = mi.MicrofacetType.GGX if bsdf.ggx else mi.MicrofacetType.Beckmann
-    facet, _ = mi.MicrofacetDistribution(kind, dr.detach(bsdf.alpha)).sample(wi, sample2)
+    facet, _ = mi.MicrofacetDistribution(kind, dr.detach(bsdf._alpha(si, active))).sample(wi, sample2)
     return mi.reflect(wi, facet), bsdf._share(ctx, si, wi, active), active
 
 
@@ -94,14 +99,17 @@ def make_tissue(variant: str) -> Any:
         and r the share of diffuse light that the film reflects from within. Both parts are reciprocal, and together
         they reflect at most what arrives.
 
-        Parameters: `alpha`, `index` (of the film, above 1), `distribution` ("beckmann" or "ggx") and
-        `diffuse_reflectance`, the base's albedo. Components: 0 the film's reflection, 1 the base.
+        Parameters: `alpha`, `index` (of the film, above 1), `distribution` ("beckmann" or "ggx"),
+        `diffuse_reflectance`, the base's albedo, and `dry_alpha`, where `wet_at` is set: the roughness where it returns
+        0, at surface points and in the lanes of a mask. Components: 0 the film's reflection, 1 the base.
         """
 
         def __init__(self, props: Any) -> None:
             super().__init__(props, 0.5)
             self.alpha = mi.Float(props.get("alpha", 0.03))
             self.index = mi.Float(props.get("index", 1.33))
+            self.dry_alpha = mi.Float(props["dry_alpha"]) if "dry_alpha" in props else None
+            self.wet_at: Any = None
             distribution = props.get("distribution", "beckmann")
             if distribution not in ("beckmann", "ggx"):
                 raise ValueError(f"distribution = {distribution!r}: unknown; allowed: beckmann, ggx")
@@ -111,17 +119,20 @@ def make_tissue(variant: str) -> Any:
         def traverse(self, callback: Any) -> None:
             callback.put("alpha", self.alpha, mi.ParamFlags.Differentiable)
             callback.put("index", self.index, mi.ParamFlags.Differentiable)
+            if self.dry_alpha is not None:
+                callback.put("dry_alpha", self.dry_alpha, mi.ParamFlags.Differentiable)
             super().traverse(callback)
 
         def parameters_changed(self, keys: Any = ()) -> None:
             # Literal parameters would be baked into the kernel, and each change would recompile it.
-            dr.make_opaque(self.alpha, self.index)
+            dr.make_opaque(self.alpha, self.index, self.dry_alpha)
+            roughest = self.alpha if self.dry_alpha is None else dr.maximum(self.alpha, self.dry_alpha)
             passed = (1 - external_reflectance(self.index)) / dr.square(self.index)
             # Reflected back from within, and the factor of both passages.
-            self.returned, self.passage = 1 - passed, (1 - MARGIN * self.alpha) / dr.square(self.index)
+            self.returned, self.passage = 1 - passed, (1 - MARGIN * roughest) / dr.square(self.index)
             dr.make_opaque(self.returned, self.passage)
 
-        _lift, _film, _values, _share, _draw = _lift, _film, _values, _share, _draw
+        _lift, _alpha, _film, _values, _share, _draw = _lift, _alpha, _film, _values, _share, _draw
 
         def to_string(self) -> str:
             return f"Tissue[alpha={self.alpha}, index={self.index}, ggx={self.ggx}]"
