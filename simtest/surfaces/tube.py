@@ -9,7 +9,14 @@ e1 = (cos psi, 0, -sin psi), e2 = (0, 1, 0) and tau = -sin v e1 + cos v e2. As T
     P_uv = (psi' r sin v - psi' r_v cos v) T + r_uv rho + r_u tau
     P_vv = (r_vv - r) rho + 2 r_v tau
 
-P_u x P_v points into the lumen while 1 - psi' r cos v > 0. Pedunculated polyps are maps of space applied to P, which
+P_u x P_v points into the lumen while 1 - psi' r cos v > 0.
+
+A closed tube goes on beyond its ends by rounded ones of depth a = radius_mm, in which u is an angle's arc: with
+phi = (u - length) / a, C and the wall r stand at length + a sin(phi), and the radius is h (a + h^2 (r - a)), where
+h = (1 - sin^4 phi)^(1/2). Tube and end share their normals and curvatures, and folds fade out before the pole. A speed
+c' of C(c(u)) takes the place of 1 in P_u and adds c'' T to P_uu; psi' and psi'' are by u. At the other end likewise.
+
+Pedunculated polyps are maps of space applied to P, which
 preserve the sense of P_u x P_v: each raises a mushroom from the wall. With z the height over the polyp's foot along its
 axis a, x the vector across it, q = |x|^2 and h the polyp's height,
 
@@ -182,6 +189,12 @@ NEWTON_TOLERANCE_MM = 1e-10
 MAX_SHIFT_MM = 3.0
 """A solution farther from the mesh's hit than this is another part of the surface: no solution."""
 
+_END_MM = 1.0
+"""How far beyond an open tube's ends a solution may lie."""
+
+_POLE_MM = 1e-6
+"""Distance of a closed tube's last points from its poles."""
+
 _PANEL_MM = 4.0
 _RELIEF_WAVES = 6
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(10)
@@ -235,9 +248,18 @@ class Tube:
         self._phase, self._taenia_phase = rng.uniform(0, 2 * math.pi, size=2)
         self._folds = (*self._draw_folds(rng), *self._polyps())
         self._relief = self._draw_relief(rng)
-        self._knots = np.linspace(0, recipe.length_mm, max(2, math.ceil(recipe.length_mm / _PANEL_MM) + 1))
+        # depth: Of each end, mm, 0 where it is open. ends: u there, at the very pole with no tangent around it
+        self.depth = recipe.radius_mm if recipe.closed else 0.0
+        arc = math.pi / 2 * self.depth - (_POLE_MM if recipe.closed else 0.0)
+        self.ends = (-arc, recipe.length_mm + arc)
+        # Of the centreline; and what of u a solution may have
+        low, high = self._span = (-self.depth, recipe.length_mm + self.depth)
+        beyond = _POLE_MM if recipe.closed else _END_MM
+        self.bounds = (self.ends[0] - beyond, self.ends[1] + beyond)
+        self._knots = np.linspace(low, high, max(2, math.ceil((high - low) / _PANEL_MM) + 1))
+        first = self._integrate(np.zeros(1), self._knots[:1])
         steps = self._integrate(self._knots[:-1], self._knots[1:])
-        self._knot_points = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        self._knot_points = np.concatenate([first, first + np.cumsum(steps, axis=0)])
         self._panels = self._fit_panels()
         # Stalks stand on the wall without any, so that is needed first.
         self._stalks: tuple[Stalk, ...] = ()
@@ -292,7 +314,7 @@ class Tube:
 
     def _check(self) -> None:
         """Raise `InputError` if the folds close the lumen or the tube bends into itself."""
-        u, v = np.meshgrid(np.linspace(0, self.recipe.length_mm, 200), np.linspace(0, 2 * math.pi, 180), indexing="ij")
+        u, v = np.meshgrid(np.linspace(*self._span, 200), np.linspace(0, 2 * math.pi, 180), indexing="ij")
         r = self.radius(u.ravel(), v.ravel()).value
         if r.min() < 0.1 * self.recipe.radius_mm:
             raise InputError(
@@ -325,7 +347,7 @@ class Tube:
     def centreline(self, u: Array) -> Array:
         """Return C(u), mm, by polynomials about the nearest knot; by the quadrature itself beyond the tube's ends."""
         spacing = self._knots[1] - self._knots[0]
-        knot = np.clip(np.rint(u / spacing), 0, len(self._knots) - 1).astype(np.int64)
+        knot = np.clip(np.rint((u - self._knots[0]) / spacing), 0, len(self._knots) - 1).astype(np.int64)
         points = self._knot_points[knot]
         share = (u - self._knots[knot]) / (spacing / 2)
         inside = np.abs(share) <= 1 + 1e-9
@@ -367,7 +389,7 @@ class Tube:
         for stalk in reversed(self._stalks):
             points = stalk.undo(points)
         # start
-        row = np.linspace(0, self.recipe.length_mm, 129)
+        row = np.linspace(*self._span, 129)
         gaps = points[:, None] - self.centreline(row)
         u = row[np.argmin(np.einsum("nki,nki->nk", gaps, gaps), axis=1)]
         # refine
@@ -434,7 +456,8 @@ class Tube:
             "length": recipe.length_mm, "radius": recipe.radius_mm, "taenia": recipe.taenia_mm,
             "taenia_phase": float(self._taenia_phase), "relief": recipe.relief_mm, "rate": rate,
             "sway": math.radians(recipe.sway_deg), "omega": omega, "phase": float(self._phase),
-            "spacing": float(self._knots[1] - self._knots[0]),
+            "spacing": float(self._knots[1] - self._knots[0]), "least": self.bounds[0], "most": self.bounds[1],
+            "depth": self.depth,
         }  # fmt: skip
         folds = [
             (f.along, math.sin(f.centre), math.cos(f.centre), f.depth, 1 / f.width**2, f.slant, f.kappa)
@@ -460,16 +483,21 @@ class Tube:
 
     def jet(self, u: Array, v: Array, second: bool = True) -> Jet:
         """Return P, mm, and its derivatives by the formulas at the head of this module; u, v of shape (N,)."""
-        radius = self.radius(u, v, second)
+        at, speed, gain, fade = self._placed(u) if self.depth else (u, 1.0, 0.0, None)
+        radius = self.radius(at, v, second)
+        bend, twist = self.heading(at)[1:]
+        if fade is not None:
+            radius = self._faded(radius, speed, gain, fade)
+            bend, twist, speed, gain = bend * speed, twist * speed**2 + bend * gain, speed[:, None], gain[:, None]
         r, (ru, rv) = radius.value[:, None], radius.gradient.T[:, :, None]
-        bend, twist = (part[:, None] for part in self.heading(u)[1:])
+        bend, twist = bend[:, None], twist[:, None]
         cv, sv = np.cos(v)[:, None], np.sin(v)[:, None]
-        T, rho, tau = self.frame(u, v)
-        along = 1 - bend * r * cv
-        parts = [self.centreline(u) + r * rho, np.stack([along * T + ru * rho, rv * rho + r * tau], axis=2)]
+        T, rho, tau = self.frame(at, v)
+        along = speed - bend * r * cv
+        parts = [self.centreline(at) + r * rho, np.stack([along * T + ru * rho, rv * rho + r * tau], axis=2)]
         if second:
             ruu, ruv, _, rvv = radius.hessian.reshape(-1, 4).T[:, :, None]
-            uu = (-twist * r * cv - 2 * bend * ru * cv) * T + (along * bend * cv + ruu) * rho - along * bend * sv * tau
+            uu = (gain - twist * r * cv - 2 * bend * ru * cv) * T + (along * bend * cv + ruu) * rho - along * bend * sv * tau
             uv = bend * (r * sv - rv * cv) * T + ruv * rho + ru * tau
             vv = (rvv - r) * rho + 2 * rv * tau
             parts.append(np.stack([uu, uv, uv, vv], axis=2).reshape(-1, 3, 2, 2))
@@ -477,6 +505,42 @@ class Tube:
         for stalk in self._stalks:
             wall = stalk.apply(wall)
         return wall
+
+    def _placed(self, u: Array) -> tuple[Array, Array, Array, Array]:
+        """Return c(u), c' and c'' of a closed tube, and h, h' and h'', shape (3, N)."""
+        middle = np.clip(u, 0.0, self.recipe.length_mm)
+        sine, cosine = np.sin((u - middle) / self.depth), np.cos((u - middle) / self.depth)
+        root = np.sqrt(1 + sine**2)
+        first, second = -2 * sine**3 / root, -2 * sine**2 * cosine * (3 + 2 * sine**2) / root**3
+        fade = np.stack([cosine * root, first / self.depth, second / self.depth**2])
+        return middle + self.depth * sine, cosine, -sine / self.depth, fade
+
+    def _faded(self, radius: Jet, speed: Array, gain: Array, fade: Array) -> Jet:
+        """Return the radius h (a + h^2 (r - a)) of a closed tube by u, given r by the place along the centreline."""
+        h, h1, h2 = fade
+        off, (fu, fv) = radius.value - self.depth, radius.gradient.T
+        cube, by = h**3, 3 * h**2 * h1  # h^3 and its derivative
+        gradient = np.stack([h1 * self.depth + by * off + cube * fu * speed, cube * fv], axis=1)
+        if len(radius.parts) == 2:
+            return Jet(h * self.depth + cube * off, gradient)
+        fuu, fuv, _, fvv = radius.hessian.reshape(-1, 4).T
+        ruu = h2 * self.depth + (6 * h * h1**2 + 3 * h**2 * h2) * off + 2 * by * fu * speed
+        ruu += cube * (fuu * speed**2 + fu * gain)
+        ruv = by * fv + cube * fuv * speed
+        hessian = np.stack([ruu, ruv, ruv, cube * fvv], axis=1).reshape(-1, 2, 2)
+        return Jet(h * self.depth + cube * off, gradient, hessian)
+
+    def reach(self, along: Array, v: Array) -> Array:
+        """Return how far the lumen reaches from a place along the centreline, mm, shape (N,); 0 beyond the ends."""
+        radius, beyond = self.radius(along, v, second=False).value, along - np.clip(along, 0, self.recipe.length_mm)
+        if not self.depth:
+            return np.where(beyond == 0, radius, 0.0)
+        h = np.sqrt(np.maximum(1 - (beyond / self.depth) ** 4, 0.0))
+        return np.asarray(h * (self.depth + h**2 * (radius - self.depth)))
+
+    def is_pole(self, u: Array) -> Mask:
+        """Return which parameters are those of a pole of a closed tube, where v says nothing."""
+        return np.asarray((self.depth > 0) & ((u <= self.ends[0]) | (u >= self.ends[1])))
 
     @property
     def has_stalks(self) -> bool:
@@ -534,7 +598,7 @@ class Tube:
             active = active[~done & (np.abs(t[active] - distance[active]) <= MAX_SHIFT_MM)]
             if not active.size:
                 break
-        inside = (u >= -1.0) & (u <= self.recipe.length_mm + 1.0)
+        inside = (u >= self.bounds[0]) & (u <= self.bounds[1])
         return np.where(solved & inside, t, np.nan), u, v
 
 
