@@ -243,11 +243,10 @@ class TubeKernel:
         squared = dr.square(sine)
         root = dr.sqrt(1 + squared)
         first, second = -2 * squared * sine / root, -2 * squared * cosine * (3 + 2 * squared) / (root * (1 + squared))
-        fade = cosine * root, first / depth, second / dr.square(depth)
-        return middle + depth * sine, cosine, -sine / depth, fade
+        return middle + depth * sine, cosine, -sine / depth, (cosine * root, first / depth, second / dr.square(depth))
 
     def _radius(self, frame: _Frame, second: bool) -> _Radius:
-        """Compute r and its derivatives (see `Tube.radius`, and `Tube._faded` of a closed tube)."""
+        """Compute r and its derivatives (see `Tube.radius`), of a closed tube h r."""
         n, u, v = self._n, frame.place, frame.v
         # taeniae
         sine, cosine = dr.sincos(3 * (v - n["taenia_phase"]))
@@ -281,18 +280,13 @@ class TubeKernel:
 
         if self._waves is not None:
             sums = self._summed(wave, self._counts["waves"], sums)
-        if not self._closed:
-            return _Radius(*sums, *([] if second else [zero] * 3))
-        h, h1, h2 = frame.fade
-        (f, fu, fv), speed, cube, by = sums[:3], frame.speed, h**3, 3 * dr.square(h) * h1
-        off = f - n["depth"]
-        first = h * n["depth"] + cube * off, h1 * n["depth"] + by * off + cube * fu * speed, cube * fv
-        if not second:
-            return _Radius(*first, zero, zero, zero)
-        fuu, fuv, fvv = sums[3:]
-        ruu = h2 * n["depth"] + (6 * h * dr.square(h1) + 3 * dr.square(h) * h2) * off + 2 * by * fu * speed
-        ruu += cube * (fuu * dr.square(speed) + fu * frame.gain)
-        return _Radius(*first, ruu, by * fv + cube * fuv * speed, cube * fvv)
+        if self._closed:
+            (r, ru, rv), speed, (h, h1, h2) = sums[:3], frame.speed, frame.fade
+            if second:
+                sums[3] = h2 * r + 2 * h1 * ru * speed + h * (sums[3] * dr.square(speed) + ru * frame.gain)
+                sums[4:] = h1 * rv + h * sums[4] * speed, h * sums[5]
+            sums[:3] = h * r, h1 * r + h * ru * speed, h * rv
+        return _Radius(*sums, *([] if second else [zero] * 3))
 
     def _summed(self, term: Any, count: Any, sums: list[Any]) -> list[Any]:
         names = ("i", *(f"sum_{i}" for i in range(len(sums))))

@@ -11,10 +11,9 @@ e1 = (cos psi, 0, -sin psi), e2 = (0, 1, 0) and tau = -sin v e1 + cos v e2. As T
 
 P_u x P_v points into the lumen while 1 - psi' r cos v > 0.
 
-A closed tube goes on beyond its ends by rounded ones of depth a = radius_mm, in which u is an angle's arc: with
-phi = (u - length) / a, C and the wall r stand at length + a sin(phi), and the radius is h (a + h^2 (r - a)), where
-h = (1 - sin^4 phi)^(1/2). Tube and end share their normals and curvatures, and folds fade out before the pole. A speed
-c' of C(c(u)) takes the place of 1 in P_u and adds c'' T to P_uu; psi' and psi'' are by u. At the other end likewise.
+A closed tube goes on beyond its ends by rounded ones of depth a = radius_mm, where C and r are those at
+c(u) = length + a sin(phi), phi = (u - length)/a, and the radius is h r, h = (1 - sin^4 phi)^(1/2); at the other end
+likewise. Normals and curvatures are continuous. c' takes the place of 1 in P_u, and c'' T is added to P_uu.
 
 Pedunculated polyps are maps of space applied to P, which
 preserve the sense of P_u x P_v: each raises a mushroom from the wall. With z the height over the polyp's foot along its
@@ -248,14 +247,12 @@ class Tube:
         self._phase, self._taenia_phase = rng.uniform(0, 2 * math.pi, size=2)
         self._folds = (*self._draw_folds(rng), *self._polyps())
         self._relief = self._draw_relief(rng)
-        # depth: Of each end, mm, 0 where it is open. ends: u there, at the very pole with no tangent around it
-        self.depth = recipe.radius_mm if recipe.closed else 0.0
-        arc = math.pi / 2 * self.depth - (_POLE_MM if recipe.closed else 0.0)
+        self.depth = recipe.radius_mm if recipe.closed else 0.0  # of each end, mm
+        # u of the ends, and of those of solutions: at the very pole there is no tangent around it
+        arc, slack = (math.pi / 2 * self.depth - _POLE_MM, _POLE_MM) if recipe.closed else (0.0, _END_MM)
         self.ends = (-arc, recipe.length_mm + arc)
-        # Of the centreline; and what of u a solution may have
+        self.bounds = (-arc - slack, self.ends[1] + slack)
         low, high = self._span = (-self.depth, recipe.length_mm + self.depth)
-        beyond = _POLE_MM if recipe.closed else _END_MM
-        self.bounds = (self.ends[0] - beyond, self.ends[1] + beyond)
         self._knots = np.linspace(low, high, max(2, math.ceil((high - low) / _PANEL_MM) + 1))
         first = self._integrate(np.zeros(1), self._knots[:1])
         steps = self._integrate(self._knots[:-1], self._knots[1:])
@@ -483,21 +480,25 @@ class Tube:
 
     def jet(self, u: Array, v: Array, second: bool = True) -> Jet:
         """Return P, mm, and its derivatives by the formulas at the head of this module; u, v of shape (N,)."""
-        at, speed, gain, fade = self._placed(u) if self.depth else (u, 1.0, 0.0, None)
+        at, *placed = self._placed(u) if self.depth else (u, 1.0, 0.0, 1.0, 0.0, 0.0)
         radius = self.radius(at, v, second)
-        bend, twist = self.heading(at)[1:]
-        if fade is not None:
-            radius = self._faded(radius, speed, gain, fade)
-            bend, twist, speed, gain = bend * speed, twist * speed**2 + bend * gain, speed[:, None], gain[:, None]
         r, (ru, rv) = radius.value[:, None], radius.gradient.T[:, :, None]
-        bend, twist = bend[:, None], twist[:, None]
+        bend, twist = (part[:, None] for part in self.heading(at)[1:])
+        # By u, on which a closed tube's place and h depend
+        speed, gain, h, h1, h2 = (np.reshape(part, (-1, 1)) for part in placed)
+        bend, twist = bend * speed, twist * speed**2 + bend * gain
+        if second:
+            ruu, ruv, _, rvv = radius.hessian.reshape(-1, 4).T[:, :, None]
+            ruu = h2 * r + 2 * h1 * ru * speed + h * (ruu * speed**2 + ru * gain)
+            ruv, rvv = h1 * rv + h * ruv * speed, h * rvv
+        r, ru, rv = h * r, h1 * r + h * ru * speed, h * rv
         cv, sv = np.cos(v)[:, None], np.sin(v)[:, None]
         T, rho, tau = self.frame(at, v)
         along = speed - bend * r * cv
         parts = [self.centreline(at) + r * rho, np.stack([along * T + ru * rho, rv * rho + r * tau], axis=2)]
         if second:
-            ruu, ruv, _, rvv = radius.hessian.reshape(-1, 4).T[:, :, None]
-            uu = (gain - twist * r * cv - 2 * bend * ru * cv) * T + (along * bend * cv + ruu) * rho - along * bend * sv * tau
+            uu = (gain - twist * r * cv - 2 * bend * ru * cv) * T
+            uu += (along * bend * cv + ruu) * rho - along * bend * sv * tau
             uv = bend * (r * sv - rv * cv) * T + ruv * rho + ru * tau
             vv = (rvv - r) * rho + 2 * rv * tau
             parts.append(np.stack([uu, uv, uv, vv], axis=2).reshape(-1, 3, 2, 2))
@@ -506,37 +507,18 @@ class Tube:
             wall = stalk.apply(wall)
         return wall
 
-    def _placed(self, u: Array) -> tuple[Array, Array, Array, Array]:
-        """Return c(u), c' and c'' of a closed tube, and h, h' and h'', shape (3, N)."""
-        middle = np.clip(u, 0.0, self.recipe.length_mm)
-        sine, cosine = np.sin((u - middle) / self.depth), np.cos((u - middle) / self.depth)
-        root = np.sqrt(1 + sine**2)
-        first, second = -2 * sine**3 / root, -2 * sine**2 * cosine * (3 + 2 * sine**2) / root**3
-        fade = np.stack([cosine * root, first / self.depth, second / self.depth**2])
-        return middle + self.depth * sine, cosine, -sine / self.depth, fade
-
-    def _faded(self, radius: Jet, speed: Array, gain: Array, fade: Array) -> Jet:
-        """Return the radius h (a + h^2 (r - a)) of a closed tube by u, given r by the place along the centreline."""
-        h, h1, h2 = fade
-        off, (fu, fv) = radius.value - self.depth, radius.gradient.T
-        cube, by = h**3, 3 * h**2 * h1  # h^3 and its derivative
-        gradient = np.stack([h1 * self.depth + by * off + cube * fu * speed, cube * fv], axis=1)
-        if len(radius.parts) == 2:
-            return Jet(h * self.depth + cube * off, gradient)
-        fuu, fuv, _, fvv = radius.hessian.reshape(-1, 4).T
-        ruu = h2 * self.depth + (6 * h * h1**2 + 3 * h**2 * h2) * off + 2 * by * fu * speed
-        ruu += cube * (fuu * speed**2 + fu * gain)
-        ruv = by * fv + cube * fuv * speed
-        hessian = np.stack([ruu, ruv, ruv, cube * fvv], axis=1).reshape(-1, 2, 2)
-        return Jet(h * self.depth + cube * off, gradient, hessian)
+    def _placed(self, u: Array) -> tuple[Array, ...]:
+        """Return c(u), c' and c'' of a closed tube, and h, h' and h''."""
+        middle, a = np.clip(u, 0.0, self.recipe.length_mm), self.depth
+        sine, cosine = np.sin((u - middle) / a), np.cos((u - middle) / a)
+        root, square = np.sqrt(1 + sine**2), sine**2
+        first, second = -2 * square * sine / root, -2 * square * cosine * (3 + 2 * square) / root**3
+        return middle + a * sine, cosine, -sine / a, cosine * root, first / a, second / a**2
 
     def reach(self, along: Array, v: Array) -> Array:
         """Return how far the lumen reaches from a place along the centreline, mm, shape (N,); 0 beyond the ends."""
-        radius, beyond = self.radius(along, v, second=False).value, along - np.clip(along, 0, self.recipe.length_mm)
-        if not self.depth:
-            return np.where(beyond == 0, radius, 0.0)
-        h = np.sqrt(np.maximum(1 - (beyond / self.depth) ** 4, 0.0))
-        return np.asarray(h * (self.depth + h**2 * (radius - self.depth)))
+        beyond = np.abs(along - np.clip(along, 0, self.recipe.length_mm)) / (self.depth or _POLE_MM)
+        return np.asarray(np.sqrt(np.maximum(1 - beyond**4, 0.0)) * self.radius(along, v, second=False).value)
 
     def is_pole(self, u: Array) -> Mask:
         """Return which parameters are those of a pole of a closed tube, where v says nothing."""
