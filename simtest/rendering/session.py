@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.rendering import adaptive, backend, elements, highlights, truth
+from simtest.rendering import adaptive, ambient, backend, elements, highlights, truth
 from simtest.rendering.backend import mi
 from simtest.rendering.built_scene import BuiltScene, build
 from simtest.rendering.elements.lights import kind_of
@@ -247,8 +247,15 @@ class Session:
             channels = tracer.centres(None, False, labels)[1]
         per_layer = len(parts) // tracer.layers
         radiance = as_radiance(parts[:per_layer])
+        if channels:
+            self._centre = channels
+        if effort.ambient:
+            sent = as_radiance(2 * ambient.scattered(tracer, self._centre_hits())).diffuse
+            if (cover := self.cover()) is not None:
+                sent[cover.seen] = 0
+            radiance = replace(radiance, diffuse=radiance.diffuse + sent)
         if self.scene.translucency is not None:
-            radiance = self._translucent(radiance, channels, self.scene.translucency)
+            radiance = self._translucent(radiance, self.scene.translucency)
         if self._instruments is not None:
             # Metal in front of the surface; nothing spreads below it.
             metal = as_radiance(parts[per_layer:])
@@ -271,13 +278,11 @@ class Session:
         finally:
             self._place_lights(middle)
 
-    def _translucent(self, radiance: Radiance, channels: list[Image], spec: Translucency) -> Radiance:
+    def _translucent(self, radiance: Radiance, spec: Translucency) -> Radiance:
         """Return radiance whose diffuse part has spread below the surface."""
         # Imported here: smooth scenes do not need its fits.
         from simtest.rendering.subsurface import spread
 
-        if channels:
-            self._centre = channels
         labels, cover = as_labels(self._centre_hits()), self.cover()
         depth = labels.depth if cover is None else np.where(cover.seen, np.float32(np.nan), labels.depth)
         diffuse = spread(radiance.diffuse, depth, labels.normal_base, self.camera, spec)

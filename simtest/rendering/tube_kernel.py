@@ -22,9 +22,6 @@ from simtest.surfaces.tube import MAX_SHIFT_MM, NEWTON_STEPS, NEWTON_TOLERANCE_M
 BLOCK = 2**17
 """Rays of a launch: they bound the memory."""
 
-END_MM = 1.0
-"""How far beyond the tube's ends a solution may lie (see `Tube.solve`)."""
-
 _FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
     **dict.fromkeys(("distance", "k_min", "k_max"), ((), float)),
     **dict.fromkeys(("position", "normal", "direction_min", "direction_max"), ((3,), float)),
@@ -49,7 +46,10 @@ class _Radius:
 
 @dataclass(frozen=True)
 class _Frame:
-    """Position, mm, and basis of points: C(u), T, rho, tau, mitsuba.Vector3d; psi' and psi''; cosine and sine of v."""
+    """Position, mm, and basis of points: C(u), T, rho, tau, mitsuba.Vector3d; psi' and psi''; cosine and sine of v.
+
+    On a closed tube also what `Tube._placed` returns.
+    """
 
     centre: Any
     T: Any
@@ -59,6 +59,11 @@ class _Frame:
     twist: Any
     cosine: Any
     sine: Any
+    place: Any
+    v: Any
+    speed: Any
+    gain: Any
+    fade: tuple[Any, ...]
 
 
 class _Table:
@@ -84,6 +89,7 @@ class TubeKernel:
         self._corners = _Table(chart.corners.reshape(-1, 2))
         constants = {**numbers.constants, "last_knot": len(numbers.panels) - 1}
         self._n = {name: mi.Float64(value) for name, value in constants.items()}
+        self._closed = chart.tube.depth > 0
         self._counts = {"folds": mi.UInt32(len(numbers.folds)), "waves": mi.UInt32(len(numbers.waves))}
         # Opaque, so that another colon compiles no new kernel.
         dr.make_opaque(list(self._n.values()), list(self._counts.values()))
@@ -117,15 +123,16 @@ class TubeKernel:
         shares = (1 - second - third, second, third)
         u, v = (sum((s * c[i] for s, c in zip(shares, corners, strict=True)), mi.Float64(0)) for i in range(2))
         t, u, v, solved = self._newton(origin, direction, start, u, v, valid)
-        solved &= (u >= -END_MM) & (u <= self._n["length"] + END_MM)
+        solved &= (u >= self._n["least"]) & (u <= self._n["most"])
         return origin, direction, t, u, v, solved
 
     def _newton(self, origin: Any, direction: Any, start: Any, u: Any, v: Any, valid: Any) -> tuple[Any, ...]:
         """Solve P(u, v) = origin + t direction (see `Tube.solve`); return t, u, v and which are solved."""
 
         def body(t: Any, u: Any, v: Any, active: Any, solved: Any, step: Any) -> tuple[Any, ...]:
-            frame, r = self._frame(u, v), self._radius(u, v, second=False)
-            along = 1 - frame.bend * r.f * frame.cosine
+            frame = self._frame(u, v)
+            r = self._radius(frame, second=False)
+            along = frame.speed - frame.bend * r.f * frame.cosine
             miss = frame.centre + r.f * frame.rho - origin - t * direction
             pu, pv = along * frame.T + r.u * frame.rho, r.v * frame.rho + r.f * frame.tau
             # The linear system P_u du + P_v dv - direction dt = -miss by Cramer's rule, for -du, -dv and dt
@@ -158,13 +165,14 @@ class TubeKernel:
         self, origin: Any, direction: Any, t: Any, u: Any, v: Any, solved: Any, model_from_camera: Array
     ) -> dict[str, Array]:
         """Evaluate normals and curvatures at solutions, and turn all to the camera frame (see `pack_points`)."""
-        frame, r = self._frame(u, v), self._radius(u, v, second=True)
+        frame = self._frame(u, v)
+        r = self._radius(frame, second=True)
         bend, cosine, sine = frame.bend, frame.cosine, frame.sine
-        A = 1 - bend * r.f * cosine
+        A = frame.speed - bend * r.f * cosine
         # Derivatives and normal in the basis (T, rho, tau)
         pu, pv = mi.Vector3d(A, r.u, 0), mi.Vector3d(0, r.v, r.f)
         puu = mi.Vector3d(
-            -frame.twist * r.f * cosine - 2 * bend * r.u * cosine, A * bend * cosine + r.uu, -A * bend * sine
+            frame.gain - frame.twist * r.f * cosine - 2 * bend * r.u * cosine, A * bend * cosine + r.uu, -A * bend * sine
         )
         puv = mi.Vector3d(bend * (r.f * sine - r.v * cosine), r.uv, r.u)
         pvv = mi.Vector3d(0, r.vv - r.f, 2 * r.v)
@@ -204,14 +212,20 @@ class TubeKernel:
     def _frame(self, u: Any, v: Any) -> _Frame:
         """Compute C(u) and the basis (see `Tube.heading`, `Tube.centreline` and `Tube.frame`)."""
         n = self._n
+        start, speed, gain, fade = 0, 1, 0, ()
+        if self._closed:
+            u, speed, gain, fade = self._placed(u)
+            start = -n["depth"]
         swaying, turning = dr.sincos(n["omega"] * u + n["phase"])
         psi = n["rate"] * u + n["sway"] * swaying
         bend = n["rate"] + n["sway"] * n["omega"] * turning
         twist = -n["sway"] * dr.square(n["omega"]) * swaying
+        if self._closed:
+            bend, twist = bend * speed, twist * dr.square(speed) + bend * gain
         # Polynomials about the nearest knot; x and z stand side by side.
-        knot = dr.clip(dr.round(u / n["spacing"]), 0, n["last_knot"])
+        knot = dr.clip(dr.round((u - start) / n["spacing"]), 0, n["last_knot"])
         start_x, start_z, *powers = self._panels.row(mi.UInt32(knot))
-        share = (u - knot * n["spacing"]) / (n["spacing"] / 2)
+        share = (u - start - knot * n["spacing"]) / (n["spacing"] / 2)
         x, z = powers[-2], powers[-1]
         for i in range(len(powers) - 4, -1, -2):
             x, z = dr.fma(x, share, powers[i]), dr.fma(z, share, powers[i + 1])
@@ -219,11 +233,21 @@ class TubeKernel:
         sine, cosine = dr.sincos(v)
         T = mi.Vector3d(s, 0, c)
         rho, tau = mi.Vector3d(cosine * c, sine, -cosine * s), mi.Vector3d(-sine * c, cosine, sine * s)
-        return _Frame(mi.Vector3d(start_x + x, 0, start_z + z), T, rho, tau, bend, twist, cosine, sine)
+        centre = mi.Vector3d(start_x + x, 0, start_z + z)
+        return _Frame(centre, T, rho, tau, bend, twist, cosine, sine, u, v, speed, gain, fade)
 
-    def _radius(self, u: Any, v: Any, second: bool) -> _Radius:
-        """Compute r and its derivatives (see `Tube.radius`)."""
-        n = self._n
+    def _placed(self, u: Any) -> tuple[Any, Any, Any, tuple[Any, ...]]:
+        """Compute c(u), c' and c'' of a closed tube, and h, h' and h'' (see `Tube._placed`)."""
+        depth, middle = self._n["depth"], dr.clip(u, 0, self._n["length"])
+        sine, cosine = dr.sincos((u - middle) / depth)
+        squared = dr.square(sine)
+        root = dr.sqrt(1 + squared)
+        first, second = -2 * squared * sine / root, -2 * squared * cosine * (3 + 2 * squared) / (root * (1 + squared))
+        return middle + depth * sine, cosine, -sine / depth, (cosine * root, first / depth, second / dr.square(depth))
+
+    def _radius(self, frame: _Frame, second: bool) -> _Radius:
+        """Compute r and its derivatives (see `Tube.radius`), of a closed tube h r."""
+        n, u, v = self._n, frame.place, frame.v
         # taeniae
         sine, cosine = dr.sincos(3 * (v - n["taenia_phase"]))
         zero = mi.Float64(0)
@@ -256,6 +280,12 @@ class TubeKernel:
 
         if self._waves is not None:
             sums = self._summed(wave, self._counts["waves"], sums)
+        if self._closed:
+            (r, ru, rv), speed, (h, h1, h2) = sums[:3], frame.speed, frame.fade
+            if second:
+                sums[3] = h2 * r + 2 * h1 * ru * speed + h * (sums[3] * dr.square(speed) + ru * frame.gain)
+                sums[4:] = h1 * rv + h * sums[4] * speed, h * sums[5]
+            sums[:3] = h * r, h1 * r + h * ru * speed, h * rv
         return _Radius(*sums, *([] if second else [zero] * 3))
 
     def _summed(self, term: Any, count: Any, sums: list[Any]) -> list[Any]:

@@ -40,12 +40,23 @@ class Effort(Spec):
 
     samples_per_pixel: int = Field(1, ge=1, le=4096, description="1: one ray through the pixel's centre")
     path_depth: int = Field(2, ge=2, le=64, description="2: direct light; more adds inter-reflections")
+    ambient: bool = Field(
+        False,
+        description="whether walls send diffuse light back to each other: an estimate without shadows between them, "
+        "at a small part of the price of path_depth",
+    )
     seed: int = Field(0, ge=0, lt=2**32, description="seed of the samples")
     adaptive: bool = Field(
         True,
         description="of 4 samples or more: whether pixels whose mean follows from the rays through the centres around "
         "them get no samples; it errs less than samples do",
     )
+
+    @model_validator(mode="after")
+    def _bounce_once(self) -> "Effort":
+        if self.ambient and self.path_depth > 2:
+            raise ValueError(f"path_depth = {self.path_depth}: traces what ambient estimates; must be 2 with ambient")
+        return self
 
 
 class KnownSpec(Spec):

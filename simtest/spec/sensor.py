@@ -248,7 +248,20 @@ class Exposure(Spec):
         description="automatic: the mean of the pixels' grey light, clipped and encoded, inside the view mask, where a "
         "surface is seen; tissue keeps its level, and highlights clip. The mean over the encoded channels is lower",
     )
+    centre: float | None = Field(
+        None,
+        ge=0.05,
+        le=10,
+        description="with average: standard deviation of the meter's Gaussian weights about the view's centre, share of "
+        "the frame's half diagonal; default all pixels weigh alike",
+    )
     gain: float = Field(1.0, ge=1e-6, le=1e6, description="exposure over that of the rule; 2 halves full scale")
+
+    @model_validator(mode="after")
+    def _weighs_a_mean(self) -> "Exposure":
+        if self.centre is not None and self.average is None:
+            raise ValueError(f"centre = {self.centre:g}: weighs the mean that average asks for; must be left out without it")
+        return self
 
 
 def _optional(model: type[Spec]) -> set[str]:

@@ -68,8 +68,7 @@ class Colon(MeshedSurface):
         perpendicular to T(u), in which the lumen is the disc below r(u, v).
         """
         u, v, radial = self.tube.slice_of(points)
-        free = (radial < self.tube.radius(u, v, second=False).value) & (u >= 0) & (u <= self.tube.recipe.length_mm)
-        return np.where(free, 1.0, -1.0) * self.probe.distance(points)
+        return np.where(radial < self.tube.reach(u, v), 1.0, -1.0) * self.probe.distance(points)
 
     def solved(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
         """Solve for distance, u and v by Newton's method from the hits; a ray that only grazes the mesh has none."""
@@ -107,18 +106,24 @@ def _mesh(tube: Tube, edge_mm: float | None) -> dict[str, AnyArray]:
     recipe = tube.recipe
     area = recipe.length_mm * 2 * math.pi * recipe.radius_mm
     cell = math.sqrt(2 * area / TRIANGLES) if edge_mm is None else edge_mm
-    if (count := 2 * area / cell**2) > MAX_TRIANGLES:
+    low, high = tube.ends
+    if (count := 2 * area * (high - low) / recipe.length_mm / cell**2) > MAX_TRIANGLES:
         raise InputError(f"edge_mm = {cell:g}: gives {count:.0f} triangles; at most {MAX_TRIANGLES} are allowed")
     # A regular grid over (u, v), closed around the tube ...
-    rows = max(1, round(recipe.length_mm / cell))
+    rows = max(1, round((high - low) / cell))
     columns = max(8, round(2 * math.pi * recipe.radius_mm / cell))
-    u, v = np.linspace(0, recipe.length_mm, rows + 1), 2 * math.pi / columns * np.arange(columns + 1)
+    u, v = np.linspace(low, high, rows + 1), 2 * math.pi / columns * np.arange(columns + 1)
     i, j = (index.ravel() for index in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
     # Two triangles per cell, counter-clockwise seen from the lumen as P_u x P_v points there.
     di, dj = np.array([[0, 1, 1], [0, 1, 0]]), np.array([[0, 0, 1], [0, 1, 1]])
     row, column = i[:, None, None] + di, j[:, None, None] + dj
     faces = (row * columns + column % columns).reshape(-1, 3)
     parameters = np.stack([g.ravel() for g in np.meshgrid(u, v[:-1], indexing="ij")], axis=1)
+    if recipe.closed:
+        # The first and the last ring are one vertex each.
+        faces = np.clip(faces - (columns - 1), 0, (rows - 1) * columns + 1)
+        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+        parameters = parameters[columns - 1 : 1 - columns]
     # ... is refined until its interpolated normals are good enough.
     vertices, normals = _positions(tube, parameters)
     fresh = 0
@@ -132,8 +137,10 @@ def _mesh(tube: Tube, edge_mm: float | None) -> dict[str, AnyArray]:
         fresh = before
     corners = parameters[faces]
     # A corner beyond the seam has v = 2 pi or a little more, while its vertex is that of v = 0.
-    around = corners[:, :, 1]
-    corners[:, :, 1] = np.where(around < around.max(axis=1, keepdims=True) - math.pi, around + 2 * math.pi, around)
+    turn, pole = corners[:, :, 1], tube.is_pole(corners[:, :, 0])
+    last = np.where(pole, -np.inf, turn).max(axis=1, keepdims=True)
+    turn = np.where(turn < last - math.pi, turn + 2 * math.pi, turn)
+    corners[:, :, 1] = np.where(pole, (turn.sum(axis=1, keepdims=True) - turn) / 2, turn)
     return {"vertices": vertices, "faces": faces, "normals": normals, "corners": corners}
 
 
@@ -156,6 +163,7 @@ def _split(
 
     def between(chosen: IntArray, share: float = 0.5) -> Array:
         (u0, v0), (u1, v1) = parameters[edges[chosen]].transpose(1, 2, 0)
+        v0, v1 = np.where(tube.is_pole(u0), v1, v0), np.where(tube.is_pole(u1), v0, v1)
         # The short way around, across the seam too.
         step = np.remainder(v1 - v0 + math.pi, 2 * math.pi) - math.pi
         return np.stack([u0 + share * (u1 - u0), np.remainder(v0 + share * step, 2 * math.pi)], axis=1)

@@ -66,6 +66,7 @@ class ColonRecipe(Spec):
     fold_spacing_mm: float = Field(22.0, ge=5, le=100, description="mean distance between rings of folds, mm")
     fold_concentration: float = Field(4.0, ge=0, le=50, description="how short a fold is around the tube; 0: a ring")
     irregularity: float = Field(0.25, ge=0, le=0.5, description="relative spread of depth, edge radius and position")
+    closed: bool = Field(False, description="whether rounded ends, radius_mm deep, close the tube beyond length_mm")
     polyps: tuple[Polyp, ...] = Field((), max_length=20, description="polyps")
     relief_mm: float = Field(0.0, ge=0, le=0.2, description="amplitude of each wave of the mucosa's fine relief, mm")
     relief_length_mm: float = Field(4.0, ge=2, le=30, description="mean wavelength of the relief, mm")

@@ -9,7 +9,13 @@ e1 = (cos psi, 0, -sin psi), e2 = (0, 1, 0) and tau = -sin v e1 + cos v e2. As T
     P_uv = (psi' r sin v - psi' r_v cos v) T + r_uv rho + r_u tau
     P_vv = (r_vv - r) rho + 2 r_v tau
 
-P_u x P_v points into the lumen while 1 - psi' r cos v > 0. Pedunculated polyps are maps of space applied to P, which
+P_u x P_v points into the lumen while 1 - psi' r cos v > 0.
+
+A closed tube goes on beyond its ends by rounded ones of depth a = radius_mm, where C and r are those at
+c(u) = length + a sin(phi), phi = (u - length)/a, and the radius is h r, h = (1 - sin^4 phi)^(1/2); at the other end
+likewise. Normals and curvatures are continuous. c' takes the place of 1 in P_u, and c'' T is added to P_uu.
+
+Pedunculated polyps are maps of space applied to P, which
 preserve the sense of P_u x P_v: each raises a mushroom from the wall. With z the height over the polyp's foot along its
 axis a, x the vector across it, q = |x|^2 and h the polyp's height,
 
@@ -182,6 +188,12 @@ NEWTON_TOLERANCE_MM = 1e-10
 MAX_SHIFT_MM = 3.0
 """A solution farther from the mesh's hit than this is another part of the surface: no solution."""
 
+_END_MM = 1.0
+"""How far beyond an open tube's ends a solution may lie."""
+
+_POLE_MM = 1e-6
+"""Distance of a closed tube's last points from its poles."""
+
 _PANEL_MM = 4.0
 _RELIEF_WAVES = 6
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(10)
@@ -235,9 +247,16 @@ class Tube:
         self._phase, self._taenia_phase = rng.uniform(0, 2 * math.pi, size=2)
         self._folds = (*self._draw_folds(rng), *self._polyps())
         self._relief = self._draw_relief(rng)
-        self._knots = np.linspace(0, recipe.length_mm, max(2, math.ceil(recipe.length_mm / _PANEL_MM) + 1))
+        self.depth = recipe.radius_mm if recipe.closed else 0.0  # of each end, mm
+        # u of the ends, and of those of solutions: at the very pole there is no tangent around it
+        arc, slack = (math.pi / 2 * self.depth - _POLE_MM, _POLE_MM) if recipe.closed else (0.0, _END_MM)
+        self.ends = (-arc, recipe.length_mm + arc)
+        self.bounds = (-arc - slack, self.ends[1] + slack)
+        low, high = self._span = (-self.depth, recipe.length_mm + self.depth)
+        self._knots = np.linspace(low, high, max(2, math.ceil((high - low) / _PANEL_MM) + 1))
+        first = self._integrate(np.zeros(1), self._knots[:1])
         steps = self._integrate(self._knots[:-1], self._knots[1:])
-        self._knot_points = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        self._knot_points = np.concatenate([first, first + np.cumsum(steps, axis=0)])
         self._panels = self._fit_panels()
         # Stalks stand on the wall without any, so that is needed first.
         self._stalks: tuple[Stalk, ...] = ()
@@ -292,7 +311,7 @@ class Tube:
 
     def _check(self) -> None:
         """Raise `InputError` if the folds close the lumen or the tube bends into itself."""
-        u, v = np.meshgrid(np.linspace(0, self.recipe.length_mm, 200), np.linspace(0, 2 * math.pi, 180), indexing="ij")
+        u, v = np.meshgrid(np.linspace(*self._span, 200), np.linspace(0, 2 * math.pi, 180), indexing="ij")
         r = self.radius(u.ravel(), v.ravel()).value
         if r.min() < 0.1 * self.recipe.radius_mm:
             raise InputError(
@@ -325,7 +344,7 @@ class Tube:
     def centreline(self, u: Array) -> Array:
         """Return C(u), mm, by polynomials about the nearest knot; by the quadrature itself beyond the tube's ends."""
         spacing = self._knots[1] - self._knots[0]
-        knot = np.clip(np.rint(u / spacing), 0, len(self._knots) - 1).astype(np.int64)
+        knot = np.clip(np.rint((u - self._knots[0]) / spacing), 0, len(self._knots) - 1).astype(np.int64)
         points = self._knot_points[knot]
         share = (u - self._knots[knot]) / (spacing / 2)
         inside = np.abs(share) <= 1 + 1e-9
@@ -367,7 +386,7 @@ class Tube:
         for stalk in reversed(self._stalks):
             points = stalk.undo(points)
         # start
-        row = np.linspace(0, self.recipe.length_mm, 129)
+        row = np.linspace(*self._span, 129)
         gaps = points[:, None] - self.centreline(row)
         u = row[np.argmin(np.einsum("nki,nki->nk", gaps, gaps), axis=1)]
         # refine
@@ -434,7 +453,8 @@ class Tube:
             "length": recipe.length_mm, "radius": recipe.radius_mm, "taenia": recipe.taenia_mm,
             "taenia_phase": float(self._taenia_phase), "relief": recipe.relief_mm, "rate": rate,
             "sway": math.radians(recipe.sway_deg), "omega": omega, "phase": float(self._phase),
-            "spacing": float(self._knots[1] - self._knots[0]),
+            "spacing": float(self._knots[1] - self._knots[0]), "least": self.bounds[0], "most": self.bounds[1],
+            "depth": self.depth,
         }  # fmt: skip
         folds = [
             (f.along, math.sin(f.centre), math.cos(f.centre), f.depth, 1 / f.width**2, f.slant, f.kappa)
@@ -460,16 +480,25 @@ class Tube:
 
     def jet(self, u: Array, v: Array, second: bool = True) -> Jet:
         """Return P, mm, and its derivatives by the formulas at the head of this module; u, v of shape (N,)."""
-        radius = self.radius(u, v, second)
+        at, *placed = self._placed(u) if self.depth else (u, 1.0, 0.0, 1.0, 0.0, 0.0)
+        radius = self.radius(at, v, second)
         r, (ru, rv) = radius.value[:, None], radius.gradient.T[:, :, None]
-        bend, twist = (part[:, None] for part in self.heading(u)[1:])
-        cv, sv = np.cos(v)[:, None], np.sin(v)[:, None]
-        T, rho, tau = self.frame(u, v)
-        along = 1 - bend * r * cv
-        parts = [self.centreline(u) + r * rho, np.stack([along * T + ru * rho, rv * rho + r * tau], axis=2)]
+        bend, twist = (part[:, None] for part in self.heading(at)[1:])
+        # By u, on which a closed tube's place and h depend
+        speed, gain, h, h1, h2 = (np.reshape(part, (-1, 1)) for part in placed)
+        bend, twist = bend * speed, twist * speed**2 + bend * gain
         if second:
             ruu, ruv, _, rvv = radius.hessian.reshape(-1, 4).T[:, :, None]
-            uu = (-twist * r * cv - 2 * bend * ru * cv) * T + (along * bend * cv + ruu) * rho - along * bend * sv * tau
+            ruu = h2 * r + 2 * h1 * ru * speed + h * (ruu * speed**2 + ru * gain)
+            ruv, rvv = h1 * rv + h * ruv * speed, h * rvv
+        r, ru, rv = h * r, h1 * r + h * ru * speed, h * rv
+        cv, sv = np.cos(v)[:, None], np.sin(v)[:, None]
+        T, rho, tau = self.frame(at, v)
+        along = speed - bend * r * cv
+        parts = [self.centreline(at) + r * rho, np.stack([along * T + ru * rho, rv * rho + r * tau], axis=2)]
+        if second:
+            uu = (gain - twist * r * cv - 2 * bend * ru * cv) * T
+            uu += (along * bend * cv + ruu) * rho - along * bend * sv * tau
             uv = bend * (r * sv - rv * cv) * T + ruv * rho + ru * tau
             vv = (rvv - r) * rho + 2 * rv * tau
             parts.append(np.stack([uu, uv, uv, vv], axis=2).reshape(-1, 3, 2, 2))
@@ -477,6 +506,23 @@ class Tube:
         for stalk in self._stalks:
             wall = stalk.apply(wall)
         return wall
+
+    def _placed(self, u: Array) -> tuple[Array, ...]:
+        """Return c(u), c' and c'' of a closed tube, and h, h' and h''."""
+        middle, a = np.clip(u, 0.0, self.recipe.length_mm), self.depth
+        sine, cosine = np.sin((u - middle) / a), np.cos((u - middle) / a)
+        root, square = np.sqrt(1 + sine**2), sine**2
+        first, second = -2 * square * sine / root, -2 * square * cosine * (3 + 2 * square) / root**3
+        return middle + a * sine, cosine, -sine / a, cosine * root, first / a, second / a**2
+
+    def reach(self, along: Array, v: Array) -> Array:
+        """Return how far the lumen reaches from a place along the centreline, mm, shape (N,); 0 beyond the ends."""
+        beyond = np.abs(along - np.clip(along, 0, self.recipe.length_mm)) / (self.depth or _POLE_MM)
+        return np.asarray(np.sqrt(np.maximum(1 - beyond**4, 0.0)) * self.radius(along, v, second=False).value)
+
+    def is_pole(self, u: Array) -> Mask:
+        """Return which parameters are those of a pole of a closed tube, where v says nothing."""
+        return np.asarray((self.depth > 0) & ((u <= self.ends[0]) | (u >= self.ends[1])))
 
     @property
     def has_stalks(self) -> bool:
@@ -534,7 +580,7 @@ class Tube:
             active = active[~done & (np.abs(t[active] - distance[active]) <= MAX_SHIFT_MM)]
             if not active.size:
                 break
-        inside = (u >= -1.0) & (u <= self.recipe.length_mm + 1.0)
+        inside = (u >= self.bounds[0]) & (u <= self.bounds[1])
         return np.where(solved & inside, t, np.nan), u, v
 
 
