@@ -7,8 +7,9 @@ from simtest.rendering import Session
 from simtest.spec import scene_from_dict
 from simtest.spec.reflectance import TISSUE_PRESETS, TissueColour
 from simtest.surfaces import make_surface, vessels
-from simtest.surfaces.tissue_pattern import BLUR_PER_DEPTH, _make, blood_absorption, make_pattern, reach
+from simtest.surfaces.tissue_pattern import _make, blood_absorption, make_pattern, reach
 from simtest.surfaces.vessels import (
+    BLUR_PER_DEPTH,
     ENDLESS,
     VesselSegments,
     grow_vessels,
@@ -151,7 +152,7 @@ def test_blood_absorbs_red_least():
 
 def test_a_profile_keeps_area_and_spread():
     radius, blur = np.array([0.02, 0.1, 0.4]), 0.06
-    width, peak = seen_profile(radius, blur)
+    width, peak = seen_profile(radius, blur / BLUR_PER_DEPTH)
     for r, w, top in zip(radius, width, peak, strict=True):
         x = np.linspace(-w, w, 20001)
         seen = top * np.maximum(1 - (x / w) ** 2, 0) ** 1.5
@@ -167,7 +168,7 @@ def test_smaller_vessels_are_fainter_and_red_is_darkened_least():
     normal, half = np.tile([0.0, 0.0, 1.0], (4, 1)), np.array([2.5, 0.0, 0.0])
     for vein in (False, True):
         lines = VesselSegments(start, start + 2 * half, normal, radius, np.full(4, vein))
-        table = make_table(lines, BLUR_PER_DEPTH * DEPTH_MM, np.full(3, ENDLESS))
+        table = make_table(lines, DEPTH_MM, np.full(3, ENDLESS))
         chord = table.chords(start + half)[:, int(vein)]
         assert (table.chords(start + half)[:, int(not vein)] == 0).all()
         left = 1 - pattern.share * (1 - np.exp(-chord[:, None] * pattern.absorption[int(vein)]))
