@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import numpy.typing as npt
 from numpy.random import Generator
 
 from simtest.errors import InputError
@@ -47,7 +48,7 @@ class Colon(MeshedSurface):
 
     def __init__(self, mesh: TriangleMesh, key: str, tube: Tube, corners: Array) -> None:
         super().__init__(mesh, "colon", key)
-        self.tube = tube
+        self.tube, self.polyps = tube, tube.polyps
         self.corners = corners  # (F, 3, 2): (u, v) of each triangle's corners
 
     @property
@@ -73,8 +74,15 @@ class Colon(MeshedSurface):
 
     def solved(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
         """Solve for distance, u and v by Newton's method from the hits; a ray that only grazes the mesh has none."""
-        u, v = np.einsum("nc,nck->kn", hits.weights, self.corners[hits.face])
-        return self.tube.solve(origins, directions, hits.distance, u, v)
+        return self.tube.solve(origins, directions, hits.distance, *self._parameters(hits))
+
+    def polyp_at(self, hits: RayHits) -> npt.NDArray[np.uint8]:
+        """Return the polyp that is hit (see `SurfaceModel.polyp_at`)."""
+        return np.where(np.isfinite(hits.distance), self.tube.polyp_at(*self._parameters(hits)), np.uint8(0))
+
+    def _parameters(self, hits: RayHits) -> Array:
+        """Return u and v of hits, interpolated in their triangles, shape (2, N)."""
+        return np.einsum("nc,nck->kn", hits.weights, self.corners[hits.face])
 
     def form(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Return normals and S by the tube's formulas (see `MeshedSurface.form`)."""

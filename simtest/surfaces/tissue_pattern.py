@@ -95,6 +95,7 @@ MESH_NODES = 8.0
 WALL = 0.1
 """Half-width of a capillary over the width of a mesh."""
 
+
 @dataclass(frozen=True)
 class Lattice:
     """A periodic field in space, linear between the nodes of a turned lattice."""
