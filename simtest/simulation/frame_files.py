@@ -61,8 +61,8 @@ INSTRUMENT_FIELDS = {
 """Further fields of a scene with instruments."""
 
 POLYP_FIELDS = {
-    "polyp": "1 + the index in polyps of the polyp that is seen, 0 where none is: where it raises the wall by more than "
-    "a tenth of its height",
+    "polyp": "1 + the index in polyps of the polyp that is seen, 0 where none is: it is where it raises the wall by "
+    "more than a tenth of its height",
     "polyps": "frame.json: those of the surface, as in a colon's recipe",
 }
 """Further fields of a surface with polyps."""

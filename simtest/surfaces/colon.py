@@ -8,7 +8,7 @@ from numpy.random import Generator
 
 from simtest.errors import InputError
 from simtest.geometry.vectors import unit
-from simtest.runtime.arrays import AnyArray, Array, IntArray, kept
+from simtest.runtime.arrays import AnyArray, Array, IntArray, Mask, kept
 from simtest.surfaces.model import RayHits, TriangleMesh, remembered
 from simtest.surfaces.recipe import ColonRecipe
 from simtest.surfaces.triangles import (
@@ -19,7 +19,7 @@ from simtest.surfaces.triangles import (
     off_between,
     rough_edges,
 )
-from simtest.surfaces.tube import Tube, TubeChart
+from simtest.surfaces.tube import POLYP_EDGE, Tube, TubeChart
 
 TRIANGLES = 200_000
 """Size of the rendered mesh: edges of about 0.4 mm at the default sizes."""
@@ -46,10 +46,11 @@ class Colon(MeshedSurface):
 
     solid = False
 
-    def __init__(self, mesh: TriangleMesh, key: str, tube: Tube, corners: Array) -> None:
+    def __init__(self, mesh: TriangleMesh, key: str, tube: Tube, corners: Array, on_polyp: Mask) -> None:
         super().__init__(mesh, "colon", key)
         self.tube, self.polyps = tube, tube.polyps
         self.corners = corners  # (F, 3, 2): (u, v) of each triangle's corners
+        self.on_polyp = on_polyp  # (F,): which triangles may show a polyp
 
     @property
     def chart(self) -> TubeChart | None:
@@ -78,7 +79,10 @@ class Colon(MeshedSurface):
 
     def polyp_at(self, hits: RayHits) -> npt.NDArray[np.uint8]:
         """Return the polyp that is hit (see `SurfaceModel.polyp_at`)."""
-        return np.where(np.isfinite(hits.distance), self.tube.polyp_at(*self._parameters(hits)), np.uint8(0))
+        numbers = np.zeros(len(hits.distance), dtype=np.uint8)
+        some = np.flatnonzero(np.isfinite(hits.distance) & self.on_polyp[hits.face])
+        numbers[some] = self.tube.polyp_at(*self._parameters(hits.rows(some)))
+        return numbers
 
     def _parameters(self, hits: RayHits) -> Array:
         """Return u and v of hits, interpolated in their triangles, shape (2, N)."""
@@ -105,8 +109,8 @@ def build(recipe: ColonRecipe, edge_mm: float | None = None) -> Colon:
     """
     tube, key = Tube(recipe), f"{recipe.model_dump_json()} {edge_mm}"
     arrays = {**kept("colon", key, lambda: _mesh(tube, edge_mm))}
-    corners = arrays.pop("corners")
-    return Colon(TriangleMesh(**arrays), key, tube, corners)
+    corners, on_polyp = arrays.pop("corners"), arrays.pop("on_polyp")
+    return Colon(TriangleMesh(**arrays), key, tube, corners, on_polyp)
 
 
 def _mesh(tube: Tube, edge_mm: float | None) -> dict[str, AnyArray]:
@@ -142,7 +146,9 @@ def _mesh(tube: Tube, edge_mm: float | None) -> dict[str, AnyArray]:
     # A corner beyond the seam has v = 2 pi or a little more, while its vertex is that of v = 0.
     around = corners[:, :, 1]
     corners[:, :, 1] = np.where(around < around.max(axis=1, keepdims=True) - math.pi, around + 2 * math.pi, around)
-    return {"vertices": vertices, "faces": faces, "normals": normals, "corners": corners}
+    # A triangle of which no corner is near a polyp's edge shows none.
+    on_polyp = tube.polyp_at(*parameters.T, edge=POLYP_EDGE / 3)[faces].any(axis=1)
+    return {"vertices": vertices, "faces": faces, "normals": normals, "corners": corners, "on_polyp": on_polyp}
 
 
 def _positions(tube: Tube, parameters: Array) -> tuple[Array, Array]:

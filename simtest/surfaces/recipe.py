@@ -23,13 +23,16 @@ HalfExtent = Annotated[float, Field(ge=10, le=200)]
 class Polyp(Spec):
     """A polyp, at its position whatever folds are there.
 
-    Sessile: a round bump of Gaussian profile on the wall. With a neck it is pedunculated: a head on a stalk.
+    Sessile: a round bump on the wall. With a neck it is pedunculated: a head on a stalk.
     """
 
     along_mm: float = Field(ge=0, le=500, description="position along the centreline, mm")
     around_deg: float = Field(ge=-360, le=360, description="position around the tube, deg")
     height_mm: float = Field(4.0, ge=0.2, le=20, description="height over the wall, mm")
     width_mm: float = Field(8.0, ge=1, le=40, description="width at half height; of a pedunculated one its head's, mm")
+    steepness: float = Field(
+        0.0, ge=0, le=10, description="of a sessile one's side; 0: Gaussian, above: more of a dome"
+    )
     neck_mm: float | None = Field(None, ge=0.5, le=30, description="width of the neck, mm; none given: sessile")
 
     @model_validator(mode="after")

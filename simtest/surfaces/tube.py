@@ -204,6 +204,9 @@ CREASES, CREASE_SHARE, CREASE_KAPPAS = 3, 0.2, (4.0, 40.0)
 POLYP_ROOM = 0.25
 """How far a drawn polyp stays from the centreline, over the tube's radius."""
 
+POLYP_STEEPNESS = (3.0, 10.0)
+"""Least and largest steepness of a drawn sessile polyp."""
+
 POLYP_EDGE = 0.1
 """A polyp is seen where it raises the wall by this share of its height."""
 
@@ -213,7 +216,10 @@ _PANEL_DEGREE = 12
 
 @dataclass(frozen=True)
 class _Fold:
-    """A fold d exp(-(u - along - slant sin(v - centre))^2 / (2 w^2) + kappa (cos(v - centre) - 1))."""
+    """A fold d exp(E - steep E^2).
+
+    E = -(u - along - slant sin(v - centre))^2 / (2 w^2) + kappa (cos(v - centre) - 1)
+    """
 
     along: float
     centre: float
@@ -221,11 +227,12 @@ class _Fold:
     width: float
     slant: float
     kappa: float
+    steep: float = 0.0
 
     def shape_at(self, u: Array, v: Array) -> Array:
         """Return its height at points over that of its top, of one that is not slanted."""
         exponent = -((u - self.along) ** 2) / (2 * self.width**2) + self.kappa * (np.cos(v - self.centre) - 1)
-        return np.asarray(np.exp(exponent))
+        return np.asarray(np.exp(exponent - self.steep * exponent**2))
 
 
 @dataclass(frozen=True)
@@ -233,7 +240,8 @@ class TubeNumbers:
     """A tube without pedunculated polyps as numbers, for a kernel."""
 
     constants: dict[str, float]  # Scalars of the module's formulas
-    # (K, 7): along, sine and cosine of the centre, depth, 1 / width^2, slant and kappa of each fold (see `_Fold`)
+    # (K, 7) or (K, 8): along, sine and cosine of the centre, depth, 1 / width^2, slant and kappa of each fold (see
+    # `_Fold`), and where any is steep how steep
     folds: Array
     waves: Array  # (W, 3): q, m and phase of the relief's waves
     # (knots, 2 + 2 * powers): x and z of each knot, then of the polynomial's coefficients about it, the lowest first
@@ -329,16 +337,19 @@ class Tube:
                 yield Polyp(along_mm=along, around_deg=around, height_mm=height, width_mm=size, neck_mm=narrow)
             else:
                 height = min(size * (0.35 + 0.35 * tall), room)
-                yield Polyp(along_mm=along, around_deg=around, height_mm=height, width_mm=size)
+                steep = float(np.interp(neck, (0, 1), POLYP_STEEPNESS))
+                yield Polyp(along_mm=along, around_deg=around, height_mm=height, width_mm=size, steepness=steep)
 
     def _bumps(self) -> Iterator[tuple[int, _Fold]]:
         """Yield the sessile polyps, by number: folds that are as wide around the tube as along it, and not slanted."""
         for number, polyp in enumerate(self.polyps):
             if polyp.neck_mm is not None:
                 continue
-            width = polyp.width_mm / math.sqrt(8 * math.log(2))
+            # At half height E - steep E^2 = -ln 2.
+            half = 2 * math.log(2) / (1 + math.sqrt(1 + 4 * polyp.steepness * math.log(2)))
+            width, around = polyp.width_mm / math.sqrt(8 * half), math.radians(polyp.around_deg)
             kappa = (self.recipe.radius_mm / width) ** 2
-            yield number, _Fold(polyp.along_mm, math.radians(polyp.around_deg), polyp.height_mm, width, 0.0, kappa)
+            yield number, _Fold(polyp.along_mm, around, polyp.height_mm, width, 0.0, kappa, polyp.steepness)
 
     def _draw_stalks(self) -> Iterator[tuple[int, Stalk]]:
         """Yield the pedunculated polyps, by number, each on the wall without any, towards the centreline."""
@@ -348,12 +359,12 @@ class Tube:
                 foot, axis = self.tangents(u, v)[0][0], -self.frame(u, v)[1][0]
                 yield number, Stalk.of_size(foot, axis, polyp.height_mm, polyp.width_mm, polyp.neck_mm)
 
-    def polyp_at(self, u: Array, v: Array) -> npt.NDArray[np.uint8]:
+    def polyp_at(self, u: Array, v: Array, edge: float = POLYP_EDGE) -> npt.NDArray[np.uint8]:
         """Return 1 + the number of the polyp at points, shape (N,), 0 where none is.
 
-        A polyp is where it raises the wall by more than `POLYP_EDGE` of its height; of several the one that does most.
+        A polyp is where it raises the wall by more than a share `edge` of its height; of several that which does most.
         """
-        most, numbers = np.full(len(u), POLYP_EDGE), np.zeros(len(u), dtype=np.uint8)
+        most, numbers = np.full(len(u), edge), np.zeros(len(u), dtype=np.uint8)
         bare = self._wall(u, v, second=False).value if self._stalks else np.empty(0)
         for number in range(len(self.polyps)):
             bump = self._sessile.get(number)
@@ -482,17 +493,22 @@ class Tube:
             sine_c, cosine_c = math.sin(fold.centre), math.cos(fold.centre)
             sine, cosine = sine_v * cosine_c - cosine_v * sine_c, cosine_v * cosine_c + sine_v * sine_c
             x, w2 = u - fold.along - fold.slant * sine, fold.width**2
-            bump = fold.depth * np.exp(-(x**2) / (2 * w2) + fold.kappa * (cosine - 1))
+            exponent = -(x**2) / (2 * w2) + fold.kappa * (cosine - 1)
             # Derivatives of the exponent E; x_v = -slant cos.
             eu, ev = -x / w2, x * fold.slant * cosine / w2 - fold.kappa * sine
+            euu, euv = -1 / w2, fold.slant * cosine / w2
+            evv = -((fold.slant * cosine) ** 2 + x * fold.slant * sine) / w2 - fold.kappa * cosine if second else 0.0
+            if fold.steep:
+                turn, twice = 1 - 2 * fold.steep * exponent, 2 * fold.steep
+                euu, euv, evv = turn * euu - twice * eu**2, turn * euv - twice * eu * ev, turn * evv - twice * ev**2
+                exponent, eu, ev = exponent - fold.steep * exponent**2, turn * eu, turn * ev
+            bump = fold.depth * np.exp(exponent)
             f -= bump
             fu -= bump * eu
             fv -= bump * ev
             if not second:
                 continue
-            euv = fold.slant * cosine / w2
-            evv = -((fold.slant * cosine) ** 2 + x * fold.slant * sine) / w2 - fold.kappa * cosine
-            fuu -= bump * (eu * eu - 1 / w2)
+            fuu -= bump * (eu * eu + euu)
             fuv -= bump * (eu * ev + euv)
             fvv -= bump * (ev * ev + evv)
         # relief
@@ -522,6 +538,7 @@ class Tube:
         }  # fmt: skip
         folds = [
             (f.along, math.sin(f.centre), math.cos(f.centre), f.depth, 1 / f.width**2, f.slant, f.kappa)
+            + ((f.steep,) if any(fold.steep for fold in self._folds) else ())
             for f in self._folds
         ]
         powers = self._panels.transpose(2, 1, 0).reshape(len(self._knots), -1)
