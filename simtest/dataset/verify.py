@@ -198,8 +198,8 @@ def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
     yield from _surface(sample, camera, relief)
     if listed and sample.images[INSTRUMENT].max() > listed:
         yield f"{INSTRUMENT} names instrument {int(sample.images[INSTRUMENT].max())} of {listed}"
-    if sample.images[POLYP].max() > len(meta.get("polyps", ())):
-        yield f"{POLYP} names polyp {int(sample.images[POLYP].max())} of {len(meta.get('polyps', ()))}"
+    if (polyps := len(meta.get("polyps", ()))) and sample.images[POLYP].max() > polyps:
+        yield f"{POLYP} names polyp {int(sample.images[POLYP].max())} of {polyps}"
     yield from _visible(sample)
     # highlights
     depth, instance = sample.images["depth"], sample.images["instance"]

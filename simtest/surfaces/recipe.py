@@ -39,6 +39,8 @@ class Polyp(Spec):
     def _shaped(self) -> "Polyp":
         if self.neck_mm is None:
             return self
+        if self.steepness:
+            raise ValueError(f"steepness = {self.steepness:g}: is of a sessile polyp; leave it out with a neck")
         low, high = (share * self.width_mm for share in NECK_SHARES)
         if not low <= self.neck_mm <= high:
             raise ValueError(f"neck_mm = {self.neck_mm:g}: must be {low:g} to {high:g}, of a head of {self.width_mm:g}")
