@@ -48,9 +48,9 @@ class Field:
     unit: str
     meaning: str  # what it holds, with frame and sign
     codec: Codec  # how the member holds it
-    # which samples store it: all, those with a relief or with listed instruments, or those of datasets that ask for it,
-    # by a key of its name
-    stored: Literal["always", "relief", "instruments", "asked"] = "always"
+    # which samples store it: all, those with a relief, polyps or listed instruments, or those of datasets that ask for
+    # it, by a key of its name
+    stored: Literal["always", "relief", "polyps", "instruments", "asked"] = "always"
     # what it is where that says no: the field of this name, or this number everywhere
     otherwise: str | int | None = None
 
@@ -59,6 +59,7 @@ class Field:
         return {
             "always": True,
             "relief": has_relief(meta),
+            "polyps": bool(meta.get("polyps")),
             "instruments": bool(meta["scene"].get("instruments")),
             "asked": False,
         }[self.stored]
@@ -240,8 +241,8 @@ CURVATURES = Codec(
     _decode_curvature,
 )
 
-INSTRUMENT, VISIBLE = "instrument", "visible"
-"""Fields of the pixels of instruments and of visible highlights."""
+INSTRUMENT, VISIBLE, POLYP = "instrument", "visible", "polyp"
+"""Fields of the pixels of instruments, of visible highlights and of polyps."""
 
 FIELDS = (
     Field("image", "image.png", "(H, W, 3)", "uint8", "sensor counts",
@@ -284,6 +285,10 @@ FIELDS = (
           "0, or 1 + the index in the scene's instruments of the metal instrument that is seen: depth and normals "
           "are its own there, curvature is NaN; stored where the scene lists instruments, elsewhere it is 0 everywhere",
           PICTURE, "instruments", 0),
+    Field(POLYP, "polyp.png", "(H, W)", "uint8", "1",
+          "0, or 1 + the index in the list polyps of the polyp that is seen: where it raises the wall by more than a "
+          "tenth of its height; stored where the anatomy has polyps, elsewhere it is 0 everywhere",
+          PICTURE, "polyps", 0),
     Field("radiance", "radiance.npy", "(H, W, 3)", "float16", "full scale",
           "linear radiance before lens and noise, share of full scale; only in datasets that keep it", HALF, "asked"),
 )  # fmt: skip

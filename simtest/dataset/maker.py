@@ -10,7 +10,7 @@ import numpy.typing as npt
 from pydantic import JsonValue
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE
-from simtest.dataset.fields import INSTRUMENT, VISIBLE, depth_scale_mm
+from simtest.dataset.fields import INSTRUMENT, POLYP, VISIBLE, depth_scale_mm
 from simtest.dataset.metadata import DetectionMeta, EstimateMeta, HighlightMeta, InstanceMeta, SampleMeta
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.dataset.sample_calibration import calibration_of_picture, stored_picture
@@ -93,6 +93,8 @@ class Maker:
             "estimates": [_estimate(row) for row in scored],
             "depth_scale_mm": depth_scale_mm(images["depth"]),
         }
+        if polyps := session.surface.at_rest.polyps:
+            meta["polyps"] = [polyp.model_dump() for polyp in polyps]
         if scene.instruments:
             meta["instrument_share"] = float(np.mean(images[INSTRUMENT] > 0))
         if seen.is_rough:
@@ -202,6 +204,8 @@ class Maker:
         truth = {"depth": seen.depth, "normal": normal, "curvature": np.stack([seen.k_min, seen.k_max], axis=-1)}
         if drawn.scene.instruments:
             truth[INSTRUMENT] = seen.instrument
+        if seen.polyp is not None:
+            truth[POLYP] = seen.polyp
         if drawn.scene.surface.relief is None:
             # The base is the fine surface: it is not stored twice.
             return truth

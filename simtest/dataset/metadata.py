@@ -91,6 +91,7 @@ class SampleMeta(TypedDict):
     detections: list[DetectionMeta]
     estimates: list[EstimateMeta]
     depth_scale_mm: float
+    polyps: NotRequired[list[dict[str, JsonValue]]]  # those of the anatomy, seen or not; where there are any
     instrument_share: NotRequired[float]  # of the pixels, on an instrument; where the scene lists instruments
     sha256: NotRequired[dict[str, str]]
 

@@ -18,7 +18,7 @@ from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Scene, apply_settings, read_toml, scene_from_dict
 from simtest.spec.keys import replace_values
 from simtest.spec.recipes import Dataset, Distribution, Family
-from simtest.surfaces.recipe import load_recipe
+from simtest.surfaces.recipe import ColonRecipe, load_recipe
 
 ANATOMY_KEYS = ("surface.seed", "surface.path", "surface.recipe")
 """Keys that determine an anatomy."""
@@ -77,12 +77,13 @@ class Plan:
     def __init__(self, dataset: Dataset) -> None:
         self.dataset = dataset
         self._bases = [self._base(k, family) for k, family in enumerate(dataset.families)]
+        self.has_polyps = False
         # All that each family may be.
         tried = [self._check(k, family) for k, family in enumerate(dataset.families)]
         self._files = [_anatomy_files(own) for own in tried]
         scenes = [scene for own in tried for scene in own]
         self._largest_px = max(scene.camera.width * scene.camera.height for scene in scenes)
-        # Samples hold the truth of the base as well, or a map of the instruments.
+        # Samples hold the truth of the base as well, or a map of the instruments or polyps.
         self.has_relief = any(scene.surface.relief is not None for scene in scenes)
         self.has_instruments = any(scene.instruments for scene in scenes)
         self._check_shared()
@@ -111,7 +112,8 @@ class Plan:
     @property
     def fields(self) -> list[Field]:
         """The fields that some sample stores."""
-        stored = {"always": True, "relief": self.has_relief, "instruments": self.has_instruments}
+        shown = {"relief": self.has_relief, "instruments": self.has_instruments, "polyps": self.has_polyps}
+        stored = {"always": True, **shown}
         return [field for field in FIELDS if stored.get(field.stored, getattr(self.dataset, field.name, False))]
 
     def _base(self, number: int, family: Family) -> dict[str, Any]:
@@ -153,7 +155,8 @@ class Plan:
                     "must be drawn by seeds or per_anatomy"
                 )
         if (file := surface.file()).suffix == ".toml":
-            load_recipe(file, surface.recipe_values)
+            recipe = load_recipe(file, surface.recipe_values)
+            self.has_polyps |= isinstance(recipe, ColonRecipe) and bool(recipe.polyps or recipe.polyp_count)
         elif family.seeds is not None:
             raise InputError(
                 f"{where}.seeds: the mesh surface.path = {file.name} is the same for each seed and might be in two "

@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from simtest.dataset.card import CARD, make_card
-from simtest.dataset.fields import BY_SUFFIX, FIELDS, INSTRUMENT, VISIBLE
+from simtest.dataset.fields import BY_SUFFIX, FIELDS, INSTRUMENT, POLYP, VISIBLE
 from simtest.dataset.index import TABLES, make_tables, shortfall
 from simtest.dataset.maker import Maker
 from simtest.dataset.manifest import (
@@ -198,6 +198,8 @@ def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
     yield from _surface(sample, camera, relief)
     if listed and sample.images[INSTRUMENT].max() > listed:
         yield f"{INSTRUMENT} names instrument {int(sample.images[INSTRUMENT].max())} of {listed}"
+    if (polyps := len(meta.get("polyps", ()))) and sample.images[POLYP].max() > polyps:
+        yield f"{POLYP} names polyp {int(sample.images[POLYP].max())} of {polyps}"
     yield from _visible(sample)
     # highlights
     depth, instance = sample.images["depth"], sample.images["instance"]

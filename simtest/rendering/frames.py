@@ -77,6 +77,8 @@ class Maps(Generic[Real]):
         1 + the index of the instrument that is seen, 0 where none is.
     direction_min, direction_max : ndarray, shape (H, W, 3), or None
         Unit principal directions, of truth.
+    polyp : ndarray of uint8, shape (H, W), or None
+        1 + the number of the polyp that is seen, 0 where none is; None of a surface without any.
     face : ndarray of int32, shape (H, W), or None
         Of labels: triangle of a mesh, 0 for other shapes; -1 where there is none.
     """
@@ -96,6 +98,7 @@ class Maps(Generic[Real]):
     instrument: npt.NDArray[np.uint8]
     direction_min: npt.NDArray[Real] | None = None
     direction_max: npt.NDArray[Real] | None = None
+    polyp: npt.NDArray[np.uint8] | None = None
     face: npt.NDArray[np.int32] | None = None
 
     __repr__ = short_repr

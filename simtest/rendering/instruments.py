@@ -278,7 +278,7 @@ class Cover:
         """Return labels or truth of a frame with those of the instruments over those of the surface."""
         above: dict[str, Any] = {
             "depth": self.distance, "position": self.position, "pool": False, "mask": True, "face": 0,
-            "instrument": self.instrument + 1, **dict.fromkeys(_NORMALS, self.normal),
+            "polyp": 0, "instrument": self.instrument + 1, **dict.fromkeys(_NORMALS, self.normal),
         }  # fmt: skip
         made: dict[str, Any] = {}
         for name, below in vars(maps).items():

@@ -17,7 +17,7 @@ from simtest.rendering import adaptive, ambient, backend, elements, highlights, 
 from simtest.rendering.backend import mi
 from simtest.rendering.built_scene import BuiltScene, build
 from simtest.rendering.elements.lights import kind_of
-from simtest.rendering.frames import Frame, HighlightPoint, MisfitMaps, Radiance, TruthMaps
+from simtest.rendering.frames import Frame, HighlightPoint, Maps, MisfitMaps, Radiance, Real, TruthMaps
 from simtest.rendering.instruments import Cover, InstrumentKernel, cover_of, place, shade
 from simtest.rendering.kernel_values import to_kernel
 from simtest.rendering.lighting import Material
@@ -211,7 +211,7 @@ class Session:
         The exact truth that `truth` computes afterwards starts from the same hits. See `radiance` for `progress`.
         """
         radiance = self.labelled_radiance(progress)
-        labels, cover = as_labels(self._labels), self.cover()
+        labels, cover = self._with_polyps(as_labels(self._labels), self._labels), self.cover()
         return Frame(radiance, labels if cover is None else cover.over(labels))
 
     @_at_its_variant
@@ -357,9 +357,17 @@ class Session:
     def _solve_maps(self, stride: int) -> TruthMaps:
         # Hits like those of a frame's labels: the truth must not depend on whether a frame was rendered before.
         centres = self.camera.pixel_centres()[::stride, ::stride]
-        hits, shading, geometric = as_hits([channel[::stride, ::stride] for channel in self._centre_hits()])
+        channels = [channel[::stride, ::stride] for channel in self._centre_hits()]
+        hits, shading, geometric = as_hits(channels)
         points = truth.solve_frame(self.surface, *self.sightlines.in_view(centres.reshape(-1, 2)), hits)
-        return truth.truth_maps(points, shading, geometric, centres.shape[:2])
+        return self._with_polyps(truth.truth_maps(points, shading, geometric, centres.shape[:2]), channels)
+
+    def _with_polyps(self, maps: Maps[Real], channels: list[Image]) -> Maps[Real]:
+        """Return maps with the polyps of the surface, where it has any; `channels` are those of the centres' hits."""
+        if not (rest := self.surface.at_rest).polyps:
+            return maps
+        numbers = rest.polyp_at(as_hits(channels)[0]).reshape(maps.mask.shape)
+        return replace(maps, polyp=np.where(maps.mask, numbers, np.uint8(0)))
 
     @_at_its_variant
     def depths(self) -> Array:

@@ -14,7 +14,7 @@ from simtest.rendering.kernel_values import channels
 from simtest.runtime.arrays import Array
 from simtest.surfaces.deformation import DeformedSurface, inverse_transpose
 from simtest.surfaces.relief_field import NODES, ReliefField
-from simtest.surfaces.vessels import ENDLESS, PRIMES
+from simtest.surfaces.vessels import BLUR_PER_DEPTH, ENDLESS, LEAST_CHORD, PRIMES
 
 if TYPE_CHECKING:
     from simtest.surfaces.tissue_pattern import Lattice, TissuePattern
@@ -230,9 +230,9 @@ HEADER = 64
 PACKET = 4
 """Numbers that one gather reads."""
 
-TURN, PER_MM, MASK, ROWS, HALF = 32, 50, 51, 52, 53
-"""Where the header holds both lattices' turns, cells over mm, what of a hash is the slot, the first row, and half-sizes
-beyond which vessels are mirrored."""
+FALL, TURN, PER_MM, MASK, ROWS, HALF = 6, 32, 50, 51, 52, 53
+"""Where the header holds how fast vessels fade with depth (of each channel), both lattices' turns, cells over mm, what
+of a hash is the slot, the first row, and half-sizes beyond which vessels are mirrored."""
 
 
 class AlbedoKernel:
@@ -248,7 +248,7 @@ class AlbedoKernel:
         lattices = (pattern.mottling, pattern.capillaries)
         self._nodes = len(pattern.mottling.values)
         table = pattern.vessels
-        self._is_mirrored = bool((table.half_mm < ENDLESS).any())
+        self._is_mirrored, self._is_layered = bool((table.half_mm < ENDLESS).any()), bool(pattern.fall.any())
         first = np.zeros(-(-len(table.first) // PACKET) * PACKET, dtype=np.float32)
         first.view(np.uint32)[: len(table.first)] = table.first
         parts = [_header(pattern), *(_packets(lattice) for lattice in lattices), first, table.rows.ravel()]
@@ -266,13 +266,16 @@ class AlbedoKernel:
         """Compute the albedo, mitsuba.Spectrum, at points of the surface, mitsuba.Point3f, model frame, mm."""
         p = mi.Vector3f(p)
         field, net = (self._lattice(i, p, active) for i in range(len(self._lattices)))
-        artery, vein = self._chords(p, active)
+        artery, vein, depths = self._chords(p, active)
         colour = []
         for channel in range(CHANNELS):
             numbers = [self._number(8 * channel + i) for i in range(6)]
             base, mottled, netted, share, arterial, venous = numbers
-            below = 1 - share * (1 - dr.exp(-arterial * artery))
-            below *= 1 - share * (1 - dr.exp(-venous * vein))
+            shares = [share] * 2
+            if self._is_layered:
+                shares = [share * dr.exp(-self._number(8 * channel + FALL) * depth) for depth in depths]
+            below = 1 - shares[0] * (1 - dr.exp(-arterial * artery))
+            below *= 1 - shares[1] * (1 - dr.exp(-venous * vein))
             colour.append(dr.clip(base * dr.exp(-field * mottled - net * netted) * below, 0, 1))
         if channels() == CHANNELS:
             return mi.Spectrum(*colour)
@@ -289,8 +292,8 @@ class AlbedoKernel:
     def _packet(self, index: Any, active: Any) -> Any:
         return dr.gather(mi.Vector4f, self._buffer, index, active)
 
-    def _chords(self, p: Any, active: Any) -> tuple[Any, Any]:
-        """Compute the chords, mm, through arteries and veins below points; see `SegmentTable.chords`."""
+    def _chords(self, p: Any, active: Any) -> tuple[Any, Any, list[Any]]:
+        """Compute the chords, mm, through arteries and veins below points, and depths; see `SegmentTable.seen`."""
         if self._is_mirrored:
             half = mi.Vector3f(*(self._number(HALF + axis) for axis in range(3)))
             number = dr.round(p / (2 * half))
@@ -304,17 +307,25 @@ class AlbedoKernel:
         rows = self._whole(mi.UInt32(ROWS))
         row, last = rows + 2 * row, rows + 2 * last
 
-        def step(row: Any, artery: Any, vein: Any) -> tuple[Any, Any, Any]:
+        def step(row: Any, artery: Any, vein: Any, *sums: Any) -> tuple[Any, ...]:
             start, along = self._packet(row, active), self._packet(row + 1, active)
             gap, d = p - mi.Vector3f(*start[:3]), mi.Vector3f(*along[:3])
             t = dr.clip(dr.dot(gap, d) / dr.squared_norm(d), 0, 1)
             inside = dr.maximum(1 - dr.squared_norm(gap - t * d) / (start[3] * start[3]), 0)
             chord = along[3] * inside * dr.sqrt(inside)
-            return row + 2, dr.maximum(artery, chord), dr.maximum(vein, -chord)
+            if sums:
+                # As `seen_depth` of the profile
+                squared = dr.square(start[3]) / 6 - 3 / 32 * start[3] * dr.abs(along[3])
+                depth, weights = dr.safe_sqrt(squared) / BLUR_PER_DEPTH, (dr.maximum(chord, 0), dr.maximum(-chord, 0))
+                parts = [part for weight in weights for part in (weight, weight * depth)]
+                sums = tuple(total + part for total, part in zip(sums, parts, strict=True))
+            return row + 2, dr.maximum(artery, chord), dr.maximum(vein, -chord), *sums
 
-        none = mi.Float(0)
-        _, artery, vein = dr.while_loop((row, none, none), lambda row, *_: mi.Bool(active) & (row < last), step)
-        return artery, vein
+        sums = [mi.Float(0)] * (6 if self._is_layered else 2)
+        state = (row, *sums)
+        _, artery, vein, *sums = dr.while_loop(state, lambda row, *_: mi.Bool(active) & (row < last), step)
+        depths = [deep / dr.maximum(weight, LEAST_CHORD) for weight, deep in zip(sums[::2], sums[1::2], strict=True)]
+        return artery, vein, depths
 
     def _lattice(self, which: int, p: Any, active: Any) -> Any:
         """Interpolate a periodic lattice; see `Lattice.at`."""
@@ -337,7 +348,7 @@ class AlbedoKernel:
 def _header(pattern: "TissuePattern") -> npt.NDArray[np.float32]:
     """Return, 8 numbers for each channel, ground, absorbances, share and absorptions; then what `TURN` etc. say."""
     header = np.zeros(HEADER, dtype=np.float32)
-    rows = (pattern.base, pattern.mottled, pattern.netted, pattern.share, *pattern.absorption)
+    rows = (pattern.base, pattern.mottled, pattern.netted, pattern.share, *pattern.absorption, pattern.fall)
     for i, values in enumerate(rows):
         header[i : 8 * CHANNELS : 8] = values
     for i, lattice in enumerate((pattern.mottling, pattern.capillaries)):

@@ -257,15 +257,21 @@ class TubeKernel:
         sine_v, cosine_v = dr.sincos(v)
 
         def fold(i: Any, *sums: Any) -> tuple[Any, ...]:
-            along, sine_c, cosine_c, depth, inverse, slant, kappa = self._folds.row(i)
+            along, sine_c, cosine_c, depth, inverse, slant, kappa, *steep = self._folds.row(i)
             sine, cosine = sine_v * cosine_c - cosine_v * sine_c, cosine_v * cosine_c + sine_v * sine_c
             x, leaning = u - along - slant * sine, slant * cosine
-            bump = depth * dr.exp(-dr.square(x) * inverse / 2 + kappa * (cosine - 1))
+            exponent = -dr.square(x) * inverse / 2 + kappa * (cosine - 1)
             eu, ev = -x * inverse, x * leaning * inverse - kappa * sine
+            evv = -(dr.square(leaning) + x * slant * sine) * inverse - kappa * cosine
+            forms = [-inverse, leaning * inverse, evv]
+            if steep:
+                turn = 1 - 2 * steep[0] * exponent
+                forms = [turn * e - 2 * steep[0] * p for e, p in zip(forms, (eu * eu, eu * ev, ev * ev), strict=True)]
+                exponent, eu, ev = exponent - steep[0] * dr.square(exponent), turn * eu, turn * ev
+            bump = depth * dr.exp(exponent)
             parts = [1, eu, ev]
             if second:
-                evv = -(dr.square(leaning) + x * slant * sine) * inverse - kappa * cosine
-                parts += [eu * eu - inverse, eu * ev + leaning * inverse, ev * ev + evv]
+                parts += [p + e for p, e in zip((eu * eu, eu * ev, ev * ev), forms, strict=True)]
             return i + 1, *(total - bump * part for total, part in zip(sums, parts, strict=True))
 
         sums = self._summed(fold, self._counts["folds"], sums)

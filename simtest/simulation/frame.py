@@ -39,6 +39,7 @@ from simtest.simulation.highlights import (
 )
 from simtest.simulation.sensor import capture, centred, check_codec, collect, full_scale_of_average, noise_at, to_uint8
 from simtest.spec import Scene
+from simtest.surfaces.recipe import Polyp
 
 DARK_SHARE = 1e-12
 """A percentile of the radiance that is no more than this share of its maximum is darkness, and sets no exposure."""
@@ -158,6 +159,8 @@ class LabelledFrame(RenderedView):
         The camera's pose, mm; the world is the surface's own frame.
     variant : str
         Mitsuba variant.
+    polyps : sequence of Polyp
+        Those of the surface, seen or not, in the order of `truth.polyp`.
 
     Examples
     --------
@@ -172,6 +175,7 @@ class LabelledFrame(RenderedView):
     truth: TruthMaps
     world_from_camera: Array
     variant: str
+    polyps: Sequence[Polyp] = ()
 
     @property
     def advice(self) -> str:
@@ -213,6 +217,7 @@ def make_frame(scene: Scene, variant: str | None = None, progress: Progress | No
         truth=truth,
         world_from_camera=session.surface.model_from_camera,
         variant=session.variant,
+        polyps=session.surface.at_rest.polyps,
     )
 
 

@@ -60,6 +60,13 @@ INSTRUMENT_FIELDS = {
 }
 """Further fields of a scene with instruments."""
 
+POLYP_FIELDS = {
+    "polyp": "1 + the index in polyps of the polyp that is seen, 0 where none is: it is where it raises the wall by "
+    "more than a tenth of its height",
+    "polyps": "frame.json: those of the surface, as in a colon's recipe",
+}
+"""Further fields of a surface with polyps."""
+
 SHEET_WIDTH, SHEET_COLUMNS = 1600, 10
 """Of a sheet of pictures: its width, px, and how many stand side by side."""
 
@@ -158,6 +165,7 @@ def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
         "pool": truth.pool,
         "mask": truth.mask,
         **({"instrument": truth.instrument} if frame.scene.shown_instruments else {}),
+        **({} if truth.polyp is None else {"polyp": truth.polyp}),
     }
 
 
@@ -171,6 +179,9 @@ def _description(frame: LabelledFrame) -> Json:
         "world_from_camera": frame.world_from_camera.tolist(),
     }
     fields: dict[str, Json] = {**FIELDS, **(INSTRUMENT_FIELDS if scene.shown_instruments else {})}
+    if frame.polyps:
+        fields |= POLYP_FIELDS
+        described["polyps"] = [polyp.model_dump() for polyp in frame.polyps]
     if sensor.encodes:
         fields["frame.png"] = "the sensor's own values, as encoding says; the largest is full scale"
         response = sensor.response.model_dump(mode="json")

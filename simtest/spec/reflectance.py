@@ -65,6 +65,9 @@ class Vessels(Spec):
     smallest_mm: float = Field(ge=0.005, le=2, description="calibre of the twigs, mm")
     spacing_mm: float = Field(ge=0.2, le=50, description="mean distance between the ends of neighbouring twigs, mm")
     depth_mm: float = Field(ge=0, le=3, description="depth of the vessels below the surface, mm")
+    deepest_mm: float | None = Field(
+        None, ge=0, le=3, description="depth of the largest, mm, the twigs' being depth_mm; default: all at depth_mm"
+    )
     arterial_saturation: Share = Field(0.97, description="share of oxygenated haemoglobin in arteries")
     venous_saturation: Share = Field(0.75, description="the same in veins")
     tortuosity: float = Field(0.6, ge=0, le=1, description="how much vessels wind; 0: straight")
@@ -82,6 +85,8 @@ class Vessels(Spec):
                 f"largest_mm = {self.largest_mm:g} and spacing_mm = {self.spacing_mm:g}: vessels must not be wider "
                 "than their spacing"
             )
+        if self.deepest_mm is not None and self.deepest_mm < self.depth_mm:
+            raise ValueError(f"deepest_mm = {self.deepest_mm:g}: must be at least depth_mm, {self.depth_mm:g}")
         return self
 
 

@@ -3,11 +3,12 @@
 import math
 
 import numpy as np
+import numpy.typing as npt
 from numpy.random import Generator
 
 from simtest.errors import InputError
 from simtest.geometry.vectors import unit
-from simtest.runtime.arrays import AnyArray, Array, IntArray, kept
+from simtest.runtime.arrays import AnyArray, Array, IntArray, Mask, kept
 from simtest.surfaces.model import RayHits, TriangleMesh, remembered
 from simtest.surfaces.recipe import ColonRecipe
 from simtest.surfaces.triangles import (
@@ -18,7 +19,7 @@ from simtest.surfaces.triangles import (
     off_between,
     rough_edges,
 )
-from simtest.surfaces.tube import Tube, TubeChart
+from simtest.surfaces.tube import POLYP_EDGE, Tube, TubeChart
 
 TRIANGLES = 200_000
 """Size of the rendered mesh: edges of about 0.4 mm at the default sizes."""
@@ -45,10 +46,11 @@ class Colon(MeshedSurface):
 
     solid = False
 
-    def __init__(self, mesh: TriangleMesh, key: str, tube: Tube, corners: Array) -> None:
+    def __init__(self, mesh: TriangleMesh, key: str, tube: Tube, corners: Array, on_polyp: Mask) -> None:
         super().__init__(mesh, "colon", key)
-        self.tube = tube
+        self.tube, self.polyps = tube, tube.polyps
         self.corners = corners  # (F, 3, 2): (u, v) of each triangle's corners
+        self.on_polyp = on_polyp  # (F,): which triangles may show a polyp
 
     @property
     def chart(self) -> TubeChart | None:
@@ -72,8 +74,18 @@ class Colon(MeshedSurface):
 
     def solved(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
         """Solve for distance, u and v by Newton's method from the hits; a ray that only grazes the mesh has none."""
-        u, v = np.einsum("nc,nck->kn", hits.weights, self.corners[hits.face])
-        return self.tube.solve(origins, directions, hits.distance, u, v)
+        return self.tube.solve(origins, directions, hits.distance, *self._parameters(hits))
+
+    def polyp_at(self, hits: RayHits) -> npt.NDArray[np.uint8]:
+        """Return the polyp that is hit (see `SurfaceModel.polyp_at`)."""
+        numbers = np.zeros(len(hits.distance), dtype=np.uint8)
+        some = np.flatnonzero(np.isfinite(hits.distance) & self.on_polyp[hits.face])
+        numbers[some] = self.tube.polyp_at(*self._parameters(hits.rows(some)))
+        return numbers
+
+    def _parameters(self, hits: RayHits) -> Array:
+        """Return u and v of hits, interpolated in their triangles, shape (2, N)."""
+        return np.einsum("nc,nck->kn", hits.weights, self.corners[hits.face])
 
     def form(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Return normals and S by the tube's formulas (see `MeshedSurface.form`)."""
@@ -96,8 +108,8 @@ def build(recipe: ColonRecipe, edge_mm: float | None = None) -> Colon:
     """
     tube, key = Tube(recipe), f"{recipe.model_dump_json()} {edge_mm}"
     arrays = {**kept("colon", key, lambda: _mesh(tube, edge_mm))}
-    corners = arrays.pop("corners")
-    return Colon(TriangleMesh(**arrays), key, tube, corners)
+    corners, on_polyp = arrays.pop("corners"), arrays.pop("on_polyp")
+    return Colon(TriangleMesh(**arrays), key, tube, corners, on_polyp)
 
 
 def _mesh(tube: Tube, edge_mm: float | None) -> dict[str, AnyArray]:
@@ -141,7 +153,9 @@ def _mesh(tube: Tube, edge_mm: float | None) -> dict[str, AnyArray]:
     last = np.where(pole, -np.inf, turn).max(axis=1, keepdims=True)
     turn = np.where(turn < last - math.pi, turn + 2 * math.pi, turn)
     corners[:, :, 1] = np.where(pole, (turn.sum(axis=1, keepdims=True) - turn) / 2, turn)
-    return {"vertices": vertices, "faces": faces, "normals": normals, "corners": corners}
+    # A triangle of which no corner is near a polyp's edge shows none.
+    on_polyp = tube.polyp_at(*parameters.T, edge=POLYP_EDGE / 3)[faces].any(axis=1)
+    return {"vertices": vertices, "faces": faces, "normals": normals, "corners": corners, "on_polyp": on_polyp}
 
 
 def _positions(tube: Tube, parameters: Array) -> tuple[Array, Array]:

@@ -1,17 +1,19 @@
 """What every surface offers: its pose relative to the camera, exact points on rays, and a shape to render."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from simtest.geometry.vectors import projector, tangent_basis
 from simtest.runtime.arrays import Array, IntArray, Mask
 
 if TYPE_CHECKING:
+    from simtest.surfaces.recipe import Polyp
     from simtest.surfaces.relief_field import ReliefField
     from simtest.surfaces.tube import TubeChart
 
@@ -166,12 +168,15 @@ class SurfaceModel(ABC):
         Whether the mesh is itself the surface, whose normals change within its triangles (see `motion`).
     relief : ReliefField or None
         Its fine relief; `points` are those of the base without it (see `fine_points`).
+    polyps : sequence of Polyp
+        Those of a generated colon.
     """
 
     model_from_camera: Array
     solid: bool = True
     faceted: bool = False
     relief: "ReliefField | None" = None
+    polyps: "Sequence[Polyp]" = ()
 
     @property
     def at_rest(self) -> "SurfaceModel":
@@ -186,6 +191,10 @@ class SurfaceModel(ABC):
     def chart(self) -> "TubeChart | None":
         """What a kernel needs to solve the base's exact points as `points` does; None where it cannot."""
         return None
+
+    def polyp_at(self, hits: RayHits) -> npt.NDArray[np.uint8]:
+        """Return 1 + the number of the polyp that is hit, shape (N,), 0 where none is."""
+        return np.zeros(len(hits.distance), dtype=np.uint8)
 
     @abstractmethod
     def clearance(self, points: Array) -> Array:

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from simtest.errors import InputError
 from simtest.runtime.resources import find
-from simtest.spec.spec_model import Spec, validate
+from simtest.spec.spec_model import Share, Spec, validate
 from simtest.spec.toml_files import apply_settings, read_toml, source_name
 
 Coordinate = Annotated[float, Field(ge=-1e3, le=1e3)]
@@ -23,19 +23,24 @@ HalfExtent = Annotated[float, Field(ge=10, le=200)]
 class Polyp(Spec):
     """A polyp, at its position whatever folds are there.
 
-    Sessile: a round bump of Gaussian profile on the wall. With a neck it is pedunculated: a head on a stalk.
+    Sessile: a round bump on the wall. With a neck it is pedunculated: a head on a stalk.
     """
 
     along_mm: float = Field(ge=0, le=500, description="position along the centreline, mm")
     around_deg: float = Field(ge=-360, le=360, description="position around the tube, deg")
     height_mm: float = Field(4.0, ge=0.2, le=20, description="height over the wall, mm")
     width_mm: float = Field(8.0, ge=1, le=40, description="width at half height; of a pedunculated one its head's, mm")
+    steepness: float = Field(
+        0.0, ge=0, le=10, description="of a sessile one's side; 0: Gaussian, above: more of a dome"
+    )
     neck_mm: float | None = Field(None, ge=0.5, le=30, description="width of the neck, mm; none given: sessile")
 
     @model_validator(mode="after")
     def _shaped(self) -> "Polyp":
         if self.neck_mm is None:
             return self
+        if self.steepness:
+            raise ValueError(f"steepness = {self.steepness:g}: is of a sessile polyp; leave it out with a neck")
         low, high = (share * self.width_mm for share in NECK_SHARES)
         if not low <= self.neck_mm <= high:
             raise ValueError(f"neck_mm = {self.neck_mm:g}: must be {low:g} to {high:g}, of a head of {self.width_mm:g}")
@@ -60,14 +65,26 @@ class ColonRecipe(Spec):
     sway_deg: float = Field(8.0, ge=0, le=45, description="amplitude of the heading's oscillation, deg")
     sway_length_mm: float = Field(90.0, ge=20, le=1000, description="period of the heading's oscillation, mm")
     taenia_mm: float = Field(0.8, ge=0, le=5, description="amplitude of the three-fold modulation of the radius, mm")
+    taenia_ridge_mm: float = Field(0.0, ge=0, le=5, description="height of a ridge along each taenia, mm")
     fold_depth_mm: float = Field(7.0, ge=0, le=30, description="mean height of a fold over the wall, mm")
     # Where two folds run into each other the edge is sharper than either's own: about half of this at worst.
     fold_edge_mm: float = Field(4.5, ge=0.5, le=10, description="mean radius of curvature of a lone fold's edge, mm")
     fold_spacing_mm: float = Field(22.0, ge=5, le=100, description="mean distance between rings of folds, mm")
+    fold_stagger: float = Field(
+        0.0, ge=0, le=0.5, description="how far along each row of folds stands from its neighbour, over fold_spacing_mm"
+    )
     fold_concentration: float = Field(4.0, ge=0, le=50, description="how short a fold is around the tube; 0: a ring")
     irregularity: float = Field(0.25, ge=0, le=0.5, description="relative spread of depth, edge radius and position")
     closed: bool = Field(False, description="whether rounded ends, radius_mm deep, close the tube beyond length_mm")
+    crease_mm: float = Field(0.0, ge=0, le=3, description="mean height of the fine folds between the large ones, mm")
+    crease_spacing_mm: float = Field(
+        6.0, ge=2, le=50, description="mean distance between fine folds along the tube, mm"
+    )
     polyps: tuple[Polyp, ...] = Field((), max_length=20, description="polyps")
+    polyp_count: int = Field(0, ge=0, le=20, description="further polyps, whose places and sizes are drawn")
+    polyp_smallest_mm: float = Field(3.0, ge=1, le=20, description="least width_mm of those, even in the logarithm")
+    polyp_largest_mm: float = Field(15.0, ge=1, le=20, description="largest width_mm of those, where there is room")
+    polyp_stalked: Share = Field(0.3, description="share of those that are pedunculated")
     relief_mm: float = Field(0.0, ge=0, le=0.2, description="amplitude of each wave of the mucosa's fine relief, mm")
     relief_length_mm: float = Field(4.0, ge=2, le=30, description="mean wavelength of the relief, mm")
     seed: int = Field(0, ge=0, lt=2**32, description="seed of the irregularities")
@@ -79,7 +96,13 @@ class ColonRecipe(Spec):
                 raise ValueError(
                     f"polyps.{i}.along_mm = {polyp.along_mm:g}: must be at most length_mm = {self.length_mm:g}"
                 )
-        deepest = self.taenia_mm + self.fold_depth_mm * (1 + self.irregularity)
+        if self.polyp_smallest_mm > self.polyp_largest_mm:
+            raise ValueError(
+                f"polyp_smallest_mm = {self.polyp_smallest_mm:g}: must be at most polyp_largest_mm = "
+                f"{self.polyp_largest_mm:g}"
+            )
+        # Of a ridge and a fold, only one is high where the other is.
+        deepest = self.taenia_mm + max(self.taenia_ridge_mm, self.fold_depth_mm * (1 + self.irregularity))
         deepest += max((polyp.height_mm for polyp in self.polyps), default=0.0)
         if deepest > 0.8 * self.radius_mm:
             raise ValueError(

@@ -5,7 +5,7 @@
 for each channel c. g is the mottling, a periodic random field of space of unit deviation; n the capillaries' net, from
 0 to 1; a_c and b_c follow the root of blood's absorption, as the reflectance of a scattering medium does. L is the
 chord through a vessel (Beer and Lambert), mu_c the absorption of its blood, and s_c = exp(-depth / reach_c) the share
-of the light that comes back from below the vessel's depth.
+of the light that comes back from below the vessel's depth. Red reaches deepest: below, vessels are bluish and blurred.
 """
 
 import math
@@ -95,9 +95,6 @@ MESH_NODES = 8.0
 WALL = 0.1
 """Half-width of a capillary over the width of a mesh."""
 
-BLUR_PER_DEPTH = 0.4
-"""Standard deviation of the blur of a vessel's edge over its depth."""
-
 
 @dataclass(frozen=True)
 class Lattice:
@@ -123,16 +120,19 @@ class TissuePattern:
     mottled: Array
     netted: Array
     absorption: Array  # (2, 3): of the blood of arteries and veins, 1/mm
-    share: Array  # (3,): s_c
+    # share, fall: (3,): s_c = share exp(-fall depth); fall is 0, and share has the depth, where all vessels have one
+    share: Array
+    fall: Array
     vessels: SegmentTable
 
     def albedo(self, points: Array) -> Array:
         """Return the albedo at points of the surface, model frame, mm, linear RGB; the kernel's slow reference."""
         field, net = self.mottling.at(points), self.capillaries.at(points)
         value = self.base * np.exp(-field[:, None] * self.mottled - net[:, None] * self.netted)
-        chords = self.vessels.chords(points)
+        chords, depths = self.vessels.seen(points)
         for kind in range(2):
-            value = value * (1 - self.share * -np.expm1(-chords[:, kind, None] * self.absorption[kind]))
+            share = self.share * np.exp(-self.fall * depths[:, kind, None])
+            value = value * (1 - share * -np.expm1(-chords[:, kind, None] * self.absorption[kind]))
         return np.asarray(np.clip(value, 0, 1))
 
 
@@ -179,8 +179,14 @@ def _unpacked(arrays: Mapping[str, AnyArray]) -> TissuePattern:
 def _grown(patch: PatternPatch, spec: TissueColour) -> TissuePattern:
     """Make the pattern of a patch."""
     grow = np.random.SeedSequence(spec.seed).spawn(3)[2]
-    forest = grow_vessels(patch, spec.vessels, int(grow.generate_state(1)[0]))
-    return _pattern(spec, make_table(segments(forest), BLUR_PER_DEPTH * spec.vessels.depth_mm, np.array(patch.half_mm)))
+    vessels = spec.vessels
+    pieces = segments(grow_vessels(patch, vessels, int(grow.generate_state(1)[0])))
+    depth: Array | float = vessels.depth_mm
+    if vessels.deepest_mm is not None:
+        # Large ones lie in the submucosa, twigs in the mucosa above.
+        calibre = (2 * pieces.radius - vessels.smallest_mm) / (vessels.largest_mm - vessels.smallest_mm)
+        depth = depth + (vessels.deepest_mm - depth) * calibre.clip(0, 1)
+    return _pattern(spec, make_table(pieces, depth, np.array(patch.half_mm)))
 
 
 def _pattern(spec: TissueColour, table: SegmentTable) -> TissuePattern:
@@ -189,7 +195,8 @@ def _pattern(spec: TissueColour, table: SegmentTable) -> TissuePattern:
     blood = blood_absorption(TISSUE_SATURATION)
     # Relative to green
     root = np.sqrt(blood / blood[1])
-    vessels = spec.vessels
+    vessels, depth_reach = spec.vessels, reach(spec.blood)
+    at_one_depth = vessels.deepest_mm is None
     saturation = (vessels.arterial_saturation, vessels.venous_saturation)
     return TissuePattern(
         base=np.array(spec.base),
@@ -198,7 +205,8 @@ def _pattern(spec: TissueColour, table: SegmentTable) -> TissuePattern:
         mottled=spec.mottling.amplitude * root,
         netted=spec.capillaries.strength * root,
         absorption=vessels.strength * np.stack([blood_absorption(s) for s in saturation]),
-        share=np.exp(-vessels.depth_mm / reach(spec.blood)),
+        share=np.exp(-vessels.depth_mm / depth_reach) if at_one_depth else np.ones(3),
+        fall=np.zeros(3) if at_one_depth else 1 / depth_reach,
         vessels=table,
     )
 

@@ -33,6 +33,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from simtest.errors import InputError
 from simtest.geometry.vectors import dot, unit
@@ -40,7 +41,7 @@ from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import outer
-from simtest.surfaces.recipe import ColonRecipe
+from simtest.surfaces.recipe import ColonRecipe, Polyp
 
 NECK_AT = 0.3
 NECK_REACH = 0.3
@@ -107,6 +108,11 @@ class Stalk:
         raised = z + self._bump(q) * self._fading(z)
         narrowed = x + self._neck(raised) * self._reach(q) * x
         return narrowed + raised.outer(self.axis).affine(1.0, self.foot)
+
+    def raised(self, points: Array) -> Array:
+        """Return how high points of the wall, shape (N, 3), mm, are lifted, over the polyp's height."""
+        z, x = self._split(points)
+        return self._bump(Jet(dot(x, x))).value * self._fading(Jet(z)).value / self.height
 
     def undo(self, points: Array) -> Array:
         """Return where points, shape (N, 3), mm, come from, to rounding."""
@@ -198,13 +204,34 @@ _PANEL_MM = 4.0
 _RELIEF_WAVES = 6
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(10)
 
+RIDGE_MM = 3.0
+"""Half width of a taenia's ridge: the standard deviation of its profile."""
+
+ENDLESS_MM = 1e9
+"""Width of a fold that does not end along the tube."""
+
+CREASES, CREASE_SHARE, CREASE_KAPPAS = 3, 0.2, (4.0, 40.0)
+"""Fine folds around the tube, their width over the distance between them, and how short they are around the tube."""
+
+POLYP_ROOM = 0.25
+"""How far a drawn polyp stays from the centreline, over the tube's radius."""
+
+POLYP_STEEPNESS = (3.0, 10.0)
+"""Least and largest steepness of a drawn sessile polyp."""
+
+POLYP_EDGE = 0.1
+"""A polyp is seen where it raises the wall by this share of its height."""
+
 _PANEL_DEGREE = 12
 """Of the polynomials that stand for the centreline between two knots: exact to rounding for every bend allowed."""
 
 
 @dataclass(frozen=True)
 class _Fold:
-    """A fold d exp(-(u - along - slant sin(v - centre))^2 / (2 w^2) + kappa (cos(v - centre) - 1))."""
+    """A fold d exp(E - steep E^2).
+
+    E = -(u - along - slant sin(v - centre))^2 / (2 w^2) + kappa (cos(v - centre) - 1)
+    """
 
     along: float
     centre: float
@@ -212,6 +239,12 @@ class _Fold:
     width: float
     slant: float
     kappa: float
+    steep: float = 0.0
+
+    def shape_at(self, u: Array, v: Array) -> Array:
+        """Return its height at points over that of its top, of one that is not slanted."""
+        exponent = -((u - self.along) ** 2) / (2 * self.width**2) + self.kappa * (np.cos(v - self.centre) - 1)
+        return np.asarray(np.exp(exponent - self.steep * exponent**2))
 
 
 @dataclass(frozen=True)
@@ -219,7 +252,8 @@ class TubeNumbers:
     """A tube without pedunculated polyps as numbers, for a kernel."""
 
     constants: dict[str, float]  # Scalars of the module's formulas
-    # (K, 7): along, sine and cosine of the centre, depth, 1 / width^2, slant and kappa of each fold (see `_Fold`)
+    # (K, 7) or (K, 8): along, sine and cosine of the centre, depth, 1 / width^2, slant and kappa of each fold (see
+    # `_Fold`), and where any is steep how steep
     folds: Array
     waves: Array  # (W, 3): q, m and phase of the relief's waves
     # (knots, 2 + 2 * powers): x and z of each knot, then of the polynomial's coefficients about it, the lowest first
@@ -245,8 +279,11 @@ class Tube:
         # Stage.SWEEP: the shape is part of the case, not of a realisation's rendering or noise.
         rng = generator(recipe.seed, "anatomy", "colon", 0, Stage.SWEEP)
         self._phase, self._taenia_phase = rng.uniform(0, 2 * math.pi, size=2)
-        self._folds = (*self._draw_folds(rng), *self._polyps())
+        self._folds = (*self._draw_folds(rng), *self._ridges(), *self._draw_creases())
         self._relief = self._draw_relief(rng)
+        self.polyps = (*recipe.polyps, *self._draw_polyps())
+        self._sessile = dict(self._bumps())
+        self._folds += tuple(self._sessile.values())
         self.depth = recipe.radius_mm if recipe.closed else 0.0  # of each end, mm
         # u of the ends, and of those of solutions: at the very pole there is no tangent around it
         arc, slack = (math.pi / 2 * self.depth - _POLE_MM, _POLE_MM) if recipe.closed else (0.0, _END_MM)
@@ -259,9 +296,9 @@ class Tube:
         self._knot_points = np.concatenate([first, first + np.cumsum(steps, axis=0)])
         self._panels = self._fit_panels()
         # Stalks stand on the wall without any, so that is needed first.
-        self._stalks: tuple[Stalk, ...] = ()
+        self._stalks: dict[int, Stalk] = {}
         self._check()
-        self._stalks = tuple(self._draw_stalks())
+        self._stalks = dict(self._draw_stalks())
 
     def _draw_folds(self, rng: np.random.Generator) -> tuple[_Fold, ...]:
         recipe, spread, folds = self.recipe, self.recipe.irregularity, []
@@ -277,25 +314,83 @@ class Tube:
                 depth *= recipe.fold_depth_mm
                 # The crest's radius of curvature along u is width^2 / depth.
                 width = math.sqrt(max(depth, 1e-6) * edge * recipe.fold_edge_mm)
-                folds.append(_Fold((ring + 0.5 + shift - 1) * pitch, centre, depth, width, slant, kappa))
+                along = ring + 0.5 + shift - 1 + recipe.fold_stagger * (third - 1)
+                folds.append(_Fold(along * pitch, centre, depth, width, slant, kappa))
         return tuple(folds)
 
-    def _polyps(self) -> Iterator[_Fold]:
-        """Yield the sessile polyps: folds that are as wide around the tube as along it, and not slanted."""
-        for polyp in self.recipe.polyps:
+    def _ridges(self) -> Iterator[_Fold]:
+        """Yield a ridge along each taenia: a fold as long as the tube."""
+        recipe = self.recipe
+        for third in range(3 if recipe.taenia_ridge_mm else 0):
+            centre, kappa = self._taenia_phase + 2 * math.pi / 3 * third, (recipe.radius_mm / RIDGE_MM) ** 2
+            yield _Fold(recipe.length_mm / 2, centre, recipe.taenia_ridge_mm, ENDLESS_MM, 0.0, kappa)
+
+    def _draw_creases(self) -> Iterator[_Fold]:
+        """Yield the fine folds, anywhere around the tube, longer and shorter ones, more or less across it."""
+        recipe, rng = self.recipe, self._generator("creases")
+        rows = round(recipe.length_mm / recipe.crease_spacing_mm) if recipe.crease_mm else 0
+        for number in range(CREASES * rows):
+            along = (number + rng.uniform()) / (CREASES * rows) * recipe.length_mm
+            depth, width = recipe.crease_mm * rng.uniform(0.5, 1.5), CREASE_SHARE * recipe.crease_spacing_mm
+            slant = recipe.crease_spacing_mm * rng.uniform(-1, 1)
+            kappa = math.exp(rng.uniform(*np.log(CREASE_KAPPAS)))
+            yield _Fold(along, rng.uniform(0, 2 * math.pi), depth, width * rng.uniform(0.8, 1.25), slant, kappa)
+
+    def _generator(self, part: str) -> np.random.Generator:
+        """Return the random numbers of a part that not every colon has: it changes no other."""
+        return generator(self.recipe.seed, "anatomy", part, 0, Stage.SWEEP)
+
+    def _draw_polyps(self) -> Iterator[Polyp]:
+        """Yield polyps along the middle of the tube, smaller where the wall leaves less room."""
+        recipe, rng = self.recipe, self._generator("polyps")
+        sizes = np.log([recipe.polyp_smallest_mm, recipe.polyp_largest_mm])
+        for number in range(recipe.polyp_count):
+            along = recipe.length_mm * (0.1 + 0.8 * (number + rng.uniform()) / recipe.polyp_count)
+            around, size, stalked = rng.uniform(0, 360), math.exp(rng.uniform(*sizes)), rng.uniform()
+            tall, neck = rng.uniform(size=2)
+            wall = self.radius(np.array([along]), np.radians([around]), second=False).value[0]
+            room = max(wall - POLYP_ROOM * recipe.radius_mm, 1.0)
+            if stalked < recipe.polyp_stalked:
+                size = min(size, room)
+                height, narrow = min(size * (1 + 0.4 * tall), room), size * (0.35 + 0.25 * neck)
+                yield Polyp(along_mm=along, around_deg=around, height_mm=height, width_mm=size, neck_mm=narrow)
+            else:
+                height = min(size * (0.35 + 0.35 * tall), room)
+                steep = float(np.interp(neck, (0, 1), POLYP_STEEPNESS))
+                yield Polyp(along_mm=along, around_deg=around, height_mm=height, width_mm=size, steepness=steep)
+
+    def _bumps(self) -> Iterator[tuple[int, _Fold]]:
+        """Yield the sessile polyps, by number: folds that are as wide around the tube as along it, and not slanted."""
+        for number, polyp in enumerate(self.polyps):
             if polyp.neck_mm is not None:
                 continue
-            width = polyp.width_mm / math.sqrt(8 * math.log(2))
+            # At half height E - steep E^2 = -ln 2.
+            half = 2 * math.log(2) / (1 + math.sqrt(1 + 4 * polyp.steepness * math.log(2)))
+            width, around = polyp.width_mm / math.sqrt(8 * half), math.radians(polyp.around_deg)
             kappa = (self.recipe.radius_mm / width) ** 2
-            yield _Fold(polyp.along_mm, math.radians(polyp.around_deg), polyp.height_mm, width, 0.0, kappa)
+            yield number, _Fold(polyp.along_mm, around, polyp.height_mm, width, 0.0, kappa, polyp.steepness)
 
-    def _draw_stalks(self) -> Iterator[Stalk]:
-        """Yield the pedunculated polyps, each on the wall without any, towards the centreline."""
-        for polyp in self.recipe.polyps:
+    def _draw_stalks(self) -> Iterator[tuple[int, Stalk]]:
+        """Yield the pedunculated polyps, by number, each on the wall without any, towards the centreline."""
+        for number, polyp in enumerate(self.polyps):
             if polyp.neck_mm is not None:
                 u, v = np.array([polyp.along_mm]), np.radians([polyp.around_deg])
                 foot, axis = self.tangents(u, v)[0][0], -self.frame(u, v)[1][0]
-                yield Stalk.of_size(foot, axis, polyp.height_mm, polyp.width_mm, polyp.neck_mm)
+                yield number, Stalk.of_size(foot, axis, polyp.height_mm, polyp.width_mm, polyp.neck_mm)
+
+    def polyp_at(self, u: Array, v: Array, edge: float = POLYP_EDGE) -> npt.NDArray[np.uint8]:
+        """Return 1 + the number of the polyp at points, shape (N,), 0 where none is.
+
+        A polyp is where it raises the wall by more than a share `edge` of its height; of several that which does most.
+        """
+        most, numbers = np.full(len(u), edge), np.zeros(len(u), dtype=np.uint8)
+        bare = self._wall(u, v, second=False).value if self._stalks else np.empty(0)
+        for number in range(len(self.polyps)):
+            bump = self._sessile.get(number)
+            raised = self._stalks[number].raised(bare) if bump is None else bump.shape_at(u, v)
+            numbers[raised > most] = number + 1
+            most = np.maximum(most, raised)
+        return numbers
 
     def _draw_relief(self, rng: np.random.Generator) -> tuple[tuple[float, int, float], ...]:
         """Draw the waves cos(q u + m v + phase) of the mucosa's relief; m is an integer, so that they close."""
@@ -383,7 +478,7 @@ class Tube:
         A point that a pedunculated polyp has moved counts where it came from. u solves (x - C(u)) . T(u) = 0 by
         Newton's method, started at the nearest of a row of centreline points.
         """
-        for stalk in reversed(self._stalks):
+        for stalk in reversed(self._stalks.values()):
             points = stalk.undo(points)
         # start
         row = np.linspace(*self._span, 129)
@@ -417,17 +512,22 @@ class Tube:
             sine_c, cosine_c = math.sin(fold.centre), math.cos(fold.centre)
             sine, cosine = sine_v * cosine_c - cosine_v * sine_c, cosine_v * cosine_c + sine_v * sine_c
             x, w2 = u - fold.along - fold.slant * sine, fold.width**2
-            bump = fold.depth * np.exp(-(x**2) / (2 * w2) + fold.kappa * (cosine - 1))
+            exponent = -(x**2) / (2 * w2) + fold.kappa * (cosine - 1)
             # Derivatives of the exponent E; x_v = -slant cos.
             eu, ev = -x / w2, x * fold.slant * cosine / w2 - fold.kappa * sine
+            euu, euv = -1 / w2, fold.slant * cosine / w2
+            evv = -((fold.slant * cosine) ** 2 + x * fold.slant * sine) / w2 - fold.kappa * cosine if second else 0.0
+            if fold.steep:
+                turn, twice = 1 - 2 * fold.steep * exponent, 2 * fold.steep
+                euu, euv, evv = turn * euu - twice * eu**2, turn * euv - twice * eu * ev, turn * evv - twice * ev**2
+                exponent, eu, ev = exponent - fold.steep * exponent**2, turn * eu, turn * ev
+            bump = fold.depth * np.exp(exponent)
             f -= bump
             fu -= bump * eu
             fv -= bump * ev
             if not second:
                 continue
-            euv = fold.slant * cosine / w2
-            evv = -((fold.slant * cosine) ** 2 + x * fold.slant * sine) / w2 - fold.kappa * cosine
-            fuu -= bump * (eu * eu - 1 / w2)
+            fuu -= bump * (eu * eu + euu)
             fuv -= bump * (eu * ev + euv)
             fvv -= bump * (ev * ev + evv)
         # relief
@@ -458,6 +558,7 @@ class Tube:
         }  # fmt: skip
         folds = [
             (f.along, math.sin(f.centre), math.cos(f.centre), f.depth, 1 / f.width**2, f.slant, f.kappa)
+            + ((f.steep,) if any(fold.steep for fold in self._folds) else ())
             for f in self._folds
         ]
         powers = self._panels.transpose(2, 1, 0).reshape(len(self._knots), -1)
@@ -480,6 +581,13 @@ class Tube:
 
     def jet(self, u: Array, v: Array, second: bool = True) -> Jet:
         """Return P, mm, and its derivatives by the formulas at the head of this module; u, v of shape (N,)."""
+        wall = self._wall(u, v, second)
+        for stalk in self._stalks.values():
+            wall = stalk.apply(wall)
+        return wall
+
+    def _wall(self, u: Array, v: Array, second: bool) -> Jet:
+        """Return what `jet` returns, without pedunculated polyps."""
         at, *placed = self._placed(u) if self.depth else (u, 1.0, 0.0, 1.0, 0.0, 0.0)
         radius = self.radius(at, v, second)
         r, (ru, rv) = radius.value[:, None], radius.gradient.T[:, :, None]
@@ -502,10 +610,7 @@ class Tube:
             uv = bend * (r * sv - rv * cv) * T + ruv * rho + ru * tau
             vv = (rvv - r) * rho + 2 * rv * tau
             parts.append(np.stack([uu, uv, uv, vv], axis=2).reshape(-1, 3, 2, 2))
-        wall = Jet(*parts)
-        for stalk in self._stalks:
-            wall = stalk.apply(wall)
-        return wall
+        return Jet(*parts)
 
     def _placed(self, u: Array) -> tuple[Array, ...]:
         """Return c(u), c' and c'' of a closed tube, and h, h' and h''."""
@@ -532,7 +637,7 @@ class Tube:
     def moved_by_stalks(self, points: Array) -> Mask:
         """Return which points, shape (N, 3), mm, are near enough to a pedunculated polyp to be moved by it."""
         moved = np.zeros(len(points), dtype=bool)
-        for stalk in self._stalks:
+        for stalk in self._stalks.values():
             moved |= stalk.moves(points)
         return moved
 

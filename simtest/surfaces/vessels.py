@@ -42,6 +42,9 @@ MARGIN_MM = 0.02
 CELL_PER_WIDTH = 3.0
 """Side of a cell over the median half-width of what is seen of a vessel."""
 
+LEAST_CHORD = 1e-9
+"""mm: below, nothing is seen."""
+
 STEPS = 4
 """Points of a segment whose distance to a cell is taken."""
 
@@ -82,18 +85,25 @@ class SegmentTable:
 
     def chords(self, points: Array) -> Array:
         """Return the longest chords, mm, through arteries and veins below points, mm; shape (N, 2)."""
+        return self.seen(points)[0]
+
+    def seen(self, points: Array) -> tuple[Array, Array]:
+        """Return the chords of `chords`, and the mean depths, mm, of all vessels there by their chords, (N, 2)."""
         points = self.mirrored(points)
         slot = self.slots(points)
         first, last = self.first[slot], self.first[slot + 1]
-        longest = np.zeros((len(points), 2))
+        longest, weight, deep = np.zeros((3, len(points), 2))
         active = np.flatnonzero(last > first)
         row = first.astype(np.int64)
         while len(active):
-            chord, vein = _chord(points[active], self.rows[row[active]].astype(np.float64))
+            rows = self.rows[row[active]].astype(np.float64)
+            chord, vein = _chord(points[active], rows)
             longest[active, vein] = np.maximum(longest[active, vein], chord)
+            weight[active, vein] += chord
+            deep[active, vein] += chord * seen_depth(rows[:, 3], np.abs(rows[:, 7]))
             row[active] += 1
             active = active[row[active] < last[active]]
-        return longest
+        return longest, deep / np.maximum(weight, LEAST_CHORD)
 
 
 NO_VESSELS = SegmentTable(1.0, np.zeros(3, dtype=np.uint32), np.zeros((1, 8), dtype=np.float32))
@@ -110,20 +120,29 @@ def _chord(points: Array, rows: Array) -> tuple[Array, IntArray]:
     return np.abs(peak) * inside * np.sqrt(inside), (peak < 0).astype(np.int64)
 
 
-def seen_profile(radius: Array, blur_mm: float) -> tuple[Array, Array]:
+BLUR_PER_DEPTH = 0.4
+"""Standard deviation of the blur of a vessel's edge over its depth."""
+
+
+def seen_profile(radius: Array, depth_mm: Array | float) -> tuple[Array, Array]:
     """Return half-width R and peak, mm, of the chord L(x) = peak (1 - x^2/R^2)^(3/2) that is seen of a vessel.
 
     The chord through a cylinder is 2 sqrt(r^2 - x^2): area pi r^2, variance r^2/4. Scattering above it adds the blur's
     variance and leaves the area; this profile has both, is 0 from R on, and has no crease.
     """
-    variance = radius**2 / 4 + blur_mm**2
+    variance = radius**2 / 4 + (BLUR_PER_DEPTH * depth_mm) ** 2
     width = np.sqrt(6 * variance)
     return width, 8 * radius**2 / (3 * width)
 
 
-def make_table(segments: "VesselSegments", blur_mm: float, half_mm: Array) -> SegmentTable:
-    """Sort segments into the cells in which they are seen, through a depth that blurs by a deviation, mm."""
-    width, peak = seen_profile(segments.radius, blur_mm)
+def seen_depth(width: Array, peak: Array) -> Array:
+    """Return the depth, mm, of the vessels of profiles (`seen_profile`): r^2 = 3 R peak / 8 leaves the blur's part."""
+    return np.asarray(np.sqrt(np.maximum(width**2 / 6 - 3 / 32 * width * peak, 0)) / BLUR_PER_DEPTH)
+
+
+def make_table(segments: "VesselSegments", depth_mm: Array | float, half_mm: Array) -> SegmentTable:
+    """Sort segments, each at its depth, mm, into the cells in which they are seen."""
+    width, peak = seen_profile(segments.radius, depth_mm)
     if not len(width):
         return NO_VESSELS
     cell_mm = CELL_PER_WIDTH * float(np.median(width))

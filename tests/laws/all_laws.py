@@ -38,7 +38,7 @@ ALONE = (
 IN_SESSION = (
     rendered.photometry, rendered.exposure, rendered.truth,
     rendered.plane_errors, rendered.told_light, rendered.curved_errors, rendered.rotated,
-    reflections.lobes, reflections.emission, labels.surfaces, labels.frame_files,
+    reflections.lobes, reflections.emission, labels.surfaces, labels.polyps, labels.frame_files,
     tables.counts, tables.columns, tables.thresholds, tissues.relief,
 )  # fmt: skip
 RENDERING = (randomness.noises, lenses.lens_rays, reflections.bounces, labels.dataset)

@@ -63,6 +63,67 @@ def surfaces(session: Session) -> list[Law]:
     return [*made, _directions(session)]
 
 
+def polyps(session: Session) -> list[Law]:
+    """Compare polyps on a straight round tube with their closed form: which pixels show one, and its normals."""
+    radius, domes = 20.0, ((45.0, 80.0, 4.0, 9.0, 0.0), (58.0, 20.0, 3.0, 7.0, 5.0))
+    listed = [dict(zip(("along_mm", "around_deg", "height_mm", "width_mm", "steepness"), own, strict=True))
+              for own in domes]  # fmt: skip
+    tube = {"length_mm": 115.0, "radius_mm": radius, "bend_deg": 0.0, "sway_deg": 0.0, "taenia_mm": 0.0,
+            "fold_depth_mm": 0.0, "polyps": listed}  # fmt: skip
+    surface = {"type": "anatomy", "path": "colon", "recipe": tube, "view": "path", "path_share": 0.3}
+    scene = scene_from_dict({"surface": surface, "camera": CAMERA | {"fx": 30.0, "fy": 30.0}}, "law")
+    session.update(scene)
+
+    def rises(X: Array) -> Array:
+        """Return the height of each dome over its own, (2, N), from positions in the tube's frame, z along it."""
+        made = []
+        for along, around, _, width, steep in domes:
+            # In units of the distance at half height, where t + steep t^2 = ln 2
+            half = math.log(2) if not steep else (math.sqrt(1 + 4 * steep * math.log(2)) - 1) / (2 * steep)
+            scale = half / (width / 2) ** 2
+            turn = np.arctan2(X[:, 1], X[:, 0]) - math.radians(around)
+            t = scale * ((X[:, 2] - along) ** 2 + 2 * radius**2 * (1 - np.cos(turn)))
+            made.append(np.exp(-t - steep * t**2))
+        return np.array(made)
+
+    def free(X: Array) -> Array:
+        return np.hypot(X[:, 0], X[:, 1]) - radius + np.array([own[2] for own in domes]) @ rises(X)
+
+    truth, labels = session.truth(), session.frame().labels
+    seen = truth.mask
+    X, pose = session.to_model(truth.position[seen]), session.surface.model_from_camera
+    share = rises(X)
+    wanted = np.where(share.max(axis=0) > 0.1, 1 + share.argmax(axis=0), 0)
+    # At the edge itself, whose place the mesh rounds, nothing is asked.
+    sure = (np.abs(share - 0.1) > 2e-3).all(axis=0)
+    step = 1e-5 * np.eye(3)
+    gradient = np.stack([free(X + axis) - free(X - axis) for axis in step], axis=1)
+    on = wanted > 0
+    turned = by_hand.angle_deg(truth.normal[seen][on] @ pose[:3, :3].T, -gradient[on])
+    made = [
+        law("polyps", "off_surface", "mm", float(np.abs(free(X)).max()), 1e-8, n=len(X), about="closed form"),
+        law(
+            "polyps",
+            "normal_off",
+            "deg",
+            max(turned.tolist(), default=math.nan),
+            1e-3,
+            n=int(on.sum()),
+            about="closed form, differences",
+        ),
+    ]
+    for name, maps in (("exact", truth), ("traced", labels)):
+        assert maps.polyp is not None
+        wrong = (maps.polyp[seen] != wanted)[sure].sum() + maps.polyp[~seen].sum()
+        made.append(law("polyps", f"{name}_pixels_off", "", float(wrong), 0, n=int(sure.sum()), about="a tenth of it"))
+    for number in (1, 2):
+        shown = float((wanted == number).sum())
+        made.append(law("polyps", f"shown_{number}", "px", shown, math.inf, 20, about="it is in view"))
+    session.update(scene.model_copy(update={"surface": scene.surface.model_copy(update={"recipe": {}})}))
+    none = float(session.truth().polyp is not None)
+    return [*made, law("polyps", "without", "", none, 0, about="no mask where there is no polyp")]
+
+
 def frame_files(session: Session) -> list[Law]:
     """Write a labelled frame, and read its files as another program would."""
     scene = _scene({"type": "cylinder", "radius_mm": 4.0, "spin_deg": 90.0, "tilt_deg": 6.0})

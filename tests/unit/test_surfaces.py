@@ -178,6 +178,8 @@ SURFACES = {
     "colon, tight": {**COLON, "recipe": {"length_mm": 60, "radius_mm": 6, "bend_deg": 170, "sway_deg": 20,
                                          "sway_length_mm": 60, "fold_depth_mm": 2.5, "taenia_mm": 0.3}},
     "colon, stalks": {**COLON, "recipe": {"polyps": [*STALKED, SESSILE[1]]}},
+    "colon, haustra": {**COLON, "recipe": {"fold_stagger": 0.33, "taenia_ridge_mm": 1.5, "crease_mm": 0.5,
+                                           "polyp_count": 8, "polyp_stalked": 0.0}},
     "liver": {"type": "anatomy", "path": "liver"},
 }  # fmt: skip
 ON_RELIEF = ("plane", "sphere", "cylinder inside", "quadric", "colon", "liver")
@@ -200,7 +202,7 @@ BREATHING = [(name, None, "breathing") for name in ("colon", "liver")]
 CASES += BREATHING
 """Surface; without relief, with a bare one, or one under a film up to a level or in patches; and its deformation."""
 PATCHY = {"type": "tissue", "film": {"index": 1.34, "level": -0.5, "patches": {"wavelength_mm": 5.0}}}
-DEAR = [(name, None, "at rest") for name in ("colon, polyps", "colon, tight")]
+DEAR = [(name, None, "at rest") for name in ("colon, polyps", "colon, tight", "colon, haustra")]
 DEAR += [("colon", "bare", "at rest"), ("liver", "bare", "at rest"), ("liver", -0.5, "at rest")]
 DEAR += [
     ("sphere", None, "ringed"),
@@ -307,6 +309,7 @@ def test_points_have_the_normals_and_curvatures_of_differences(session, name, re
         ("sphere", None),
         ("colon", None),
         ("colon", "bare"),
+        ("colon, haustra", None),
         pytest.param("colon, polyps", None, marks=pytest.mark.ci),
         pytest.param("colon, tight", None, marks=pytest.mark.ci),
     ],

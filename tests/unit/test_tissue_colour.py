@@ -3,16 +3,19 @@
 import numpy as np
 import pytest
 
+from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
 from simtest.spec.reflectance import TISSUE_PRESETS, TissueColour
 from simtest.surfaces import make_surface, vessels
-from simtest.surfaces.tissue_pattern import BLUR_PER_DEPTH, _make, blood_absorption, make_pattern, reach
+from simtest.surfaces.tissue_pattern import _make, blood_absorption, make_pattern, reach
 from simtest.surfaces.vessels import (
+    BLUR_PER_DEPTH,
     ENDLESS,
     VesselSegments,
     grow_vessels,
     make_table,
+    seen_depth,
     seen_profile,
     segments,
     spread_points,
@@ -151,13 +154,51 @@ def test_blood_absorbs_red_least():
 
 def test_a_profile_keeps_area_and_spread():
     radius, blur = np.array([0.02, 0.1, 0.4]), 0.06
-    width, peak = seen_profile(radius, blur)
+    width, peak = seen_profile(radius, blur / BLUR_PER_DEPTH)
     for r, w, top in zip(radius, width, peak, strict=True):
         x = np.linspace(-w, w, 20001)
         seen = top * np.maximum(1 - (x / w) ** 2, 0) ** 1.5
         area = seen.sum() * (x[1] - x[0])
         assert area == pytest.approx(np.pi * r**2, rel=1e-4)
         assert (seen * x**2).sum() / seen.sum() == pytest.approx(r**2 / 4 + blur**2, rel=1e-4)
+
+
+def test_a_profile_tells_its_depth():
+    radius, depth = np.array([0.03, 0.1, 0.25]), np.array([0.05, 0.4, 1.0])
+    np.testing.assert_allclose(seen_depth(*seen_profile(radius, depth)), depth, rtol=1e-9)
+
+
+def test_large_vessels_lie_deeper_blurred_and_bluish():
+    surface = surface_of("plane")
+
+    def patterns(**depths):
+        return make_pattern(surface, scene(tissue=tissue_of(vessels=depths)).albedo)
+
+    shallow, same, deep = patterns(depth_mm=0.1), patterns(depth_mm=0.1, deepest_mm=0.1), patterns(deepest_mm=0.6)
+    points = on_plane(4000, 25)
+    # All at one depth is what no range of depths gives.
+    np.testing.assert_allclose(same.albedo(points), shallow.albedo(points), atol=1e-5)
+    rows = deep.vessels.rows[np.unique(deep.vessels.rows[:, :3], axis=0, return_index=True)[1]].astype(float)
+    depth = seen_depth(rows[:, 3], np.abs(rows[:, 7]))
+    radius = np.sqrt(3 / 8 * rows[:, 3] * np.abs(rows[:, 7]))
+    assert depth.min() == pytest.approx(DEPTH_MM, rel=1e-3)
+    calibre = (2 * radius - 0.06) / (0.5 - 0.06)
+    np.testing.assert_allclose(depth, DEPTH_MM + (0.6 - DEPTH_MM) * calibre, atol=1e-3)
+    assert depth.max() > 0.35
+    # Over the largest, green and blue come back sooner than red, against the same vessels near the surface.
+    over = rows[radius > 0.15]
+    middle = over[:, :3] + over[:, 4:7] / 2
+    below, above = deep.albedo(middle) / deep.base, shallow.albedo(middle) / shallow.base
+    darkest = above[:, 1] < 0.7
+    assert darkest.sum() > 20
+    assert (below[darkest, 1] > above[darkest, 1] + 0.1).all()
+    blueness = [np.log(each[darkest, 2] / each[darkest, 0]) for each in (above, below)]
+    assert (blueness[1] > blueness[0] + 0.1).all()
+
+
+def test_the_largest_vessels_are_not_above_the_twigs():
+    with pytest.raises(InputError, match=r"deepest_mm = 0\.05: must be at least depth_mm"):
+        scene(tissue={"vessels": {"deepest_mm": 0.05}})
 
 
 def test_smaller_vessels_are_fainter_and_red_is_darkened_least():
@@ -167,7 +208,7 @@ def test_smaller_vessels_are_fainter_and_red_is_darkened_least():
     normal, half = np.tile([0.0, 0.0, 1.0], (4, 1)), np.array([2.5, 0.0, 0.0])
     for vein in (False, True):
         lines = VesselSegments(start, start + 2 * half, normal, radius, np.full(4, vein))
-        table = make_table(lines, BLUR_PER_DEPTH * DEPTH_MM, np.full(3, ENDLESS))
+        table = make_table(lines, DEPTH_MM, np.full(3, ENDLESS))
         chord = table.chords(start + half)[:, int(vein)]
         assert (table.chords(start + half)[:, int(not vein)] == 0).all()
         left = 1 - pattern.share * (1 - np.exp(-chord[:, None] * pattern.absorption[int(vein)]))
@@ -337,15 +378,16 @@ def test_a_ball_has_vessels_all_around():
 
 
 @pytest.mark.render
-def test_a_frame_shows_the_albedo():
+@pytest.mark.parametrize("colour", [{}, {"vessels": {"depth_mm": 0.05, "deepest_mm": 0.6}}])
+def test_a_frame_shows_the_albedo(colour):
     data = {"surface": SURFACES["sphere"], "camera": SMALL, "rig": {"lights": [{}, {"offset_mm": 4.0, "power": 0.5}]}}
-    white, tissue = ({"type": "phong", "specular": 0.0, **base} for base in ({"diffuse": 1.0}, {"albedo": {}}))
+    white, tissue = ({"type": "phong", "specular": 0.0, **base} for base in ({"diffuse": 1.0}, {"albedo": colour}))
     plain = Session(scene_from_dict({**data, "reflectance": white}), "llvm_ad_rgb").radiance()
     session = Session(scene_from_dict({**data, "reflectance": tissue}), "llvm_ad_rgb")
     seen, truth = session.radiance(), session.truth()
     valid = truth.mask & (plain.diffuse.min(axis=-1) > 1e-6)
     assert valid.sum() > 1000
-    expected = make_pattern(session.surface, TissueColour()).albedo(session.to_model(truth.position[valid]))
+    expected = make_pattern(session.surface, TissueColour(**colour)).albedo(session.to_model(truth.position[valid]))
     np.testing.assert_allclose(seen.diffuse[valid] / plain.diffuse[valid], expected, atol=1e-3)
 
 
