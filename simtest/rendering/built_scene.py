@@ -115,7 +115,9 @@ class BuiltScene:
         """Let bounced light find the albedo of tissue by its own points."""
         # Weak: what a BSDF holds, Mitsuba holds, and Python could not free it at its end.
         kernel = weakref.proxy(albedo)
-        self.scene.shapes()[0].bsdf().albedo_at = lambda si, active: kernel.of(si, active)
+        bsdf, has_debris = self.scene.shapes()[0].bsdf(), albedo.pattern.debris is not None
+        bsdf.albedo_at = lambda si, active: kernel.of(si, active)
+        bsdf.bare_at = (lambda si, active: kernel.bare(si, active)) if has_debris else None
 
     def _set(self, suffix: str, value: Any) -> None:
         """Assign the one parameter whose path ends in `suffix`; Mitsuba names paths by its own rules."""

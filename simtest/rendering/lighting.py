@@ -105,12 +105,16 @@ class Material:
         if self.albedo is None:
             yield
             return
-        albedo, before = self.albedo.of(hit.base, hit.base.is_valid()), self.bsdf.albedo_at
+        valid, before = hit.base.is_valid(), (self.bsdf.albedo_at, self.bsdf.bare_at)
+        albedo = self.albedo.of(hit.base, valid)
         self.bsdf.albedo_at = lambda si, active: albedo
+        if self.albedo.pattern.debris is not None:
+            bare = self.albedo.bare(hit.base, valid)
+            self.bsdf.bare_at = lambda si, active: bare
         try:
             yield
         finally:
-            self.bsdf.albedo_at = before
+            self.bsdf.albedo_at, self.bsdf.bare_at = before
 
     def parts(self, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
         """Compute f cos(theta) of the lobe and of the base."""

@@ -304,6 +304,14 @@ class Session:
             self._cover = cover_of(self, self._instruments, self._centre_hits()[0])
         return self._cover
 
+    @_at_its_variant
+    def lying(self, points_px: Array) -> IntArray | None:
+        """Return what lies on tissue at pixel positions, shape (N, 2): `STOOL`, `BILE` or 0; None without debris."""
+        if self._pattern is None or self._pattern.debris is None or self._albedo is None:
+            return None
+        hit = self._tracer().hit(*(to_kernel(mi.Float, axis, np.float32) for axis in points_px.T))[2]
+        return evaluate([self._albedo.lying(hit.base)], len(points_px))[0].astype(np.int64)
+
     # Truth -------------------------------------------------------------------------------------------------------
 
     def to_model(self, points: Array) -> Array:

@@ -22,6 +22,7 @@ from simtest.errors import InputError
 from simtest.geometry import Camera, smooth
 from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
 from simtest.rendering.highlights import radii_px
+from simtest.rendering.tissue_kernels import STOOL
 from simtest.runtime.arrays import Array, Image, Mask, short_repr
 from simtest.runtime.files import as_path
 from simtest.runtime.seeds import from_integer
@@ -37,7 +38,15 @@ from simtest.simulation.highlights import (
     find_spots,
     verdicts,
 )
-from simtest.simulation.sensor import capture, check_codec, collect, full_scale_of_average, noise_at, to_uint8
+from simtest.simulation.sensor import (
+    capture,
+    check_codec,
+    collect,
+    drawn_over,
+    full_scale_of_average,
+    noise_at,
+    to_uint8,
+)
 from simtest.spec import Scene
 
 DARK_SHARE = 1e-12
@@ -49,6 +58,9 @@ DRAWS, FEW_DRAWS = 32, 4
 DEAR_SAMPLES = 16
 """With so many samples a pixel or fewer, a frame with a source of finite size costs no more than its quick look. A part
 of what a dataset's seed means: another number keeps other draws."""
+
+COVERED = "covered by stool or by what is drawn"
+"""Why a highlight point is none that can be seen."""
 
 TISSUE = np.array([0.55, 0.27, 0.22], dtype=np.float32)
 """Colour of a surface that has none of its own, linear."""
@@ -82,6 +94,8 @@ class RenderedView:
         What reconstruction is told.
     instruments : ndarray of uint8, shape (H, W), or None
         1 + the index of the instrument that is seen, 0 where none is; None in a scene without instruments.
+    debris : ndarray of uint8, shape (H, W), or None
+        What lies on the tissue at each pixel's centre: 1 stool, 2 bile, 0 nothing; None in a scene without debris.
     """
 
     scene: Scene
@@ -92,6 +106,7 @@ class RenderedView:
     full_scale: float
     calibration: Calibration
     instruments: npt.NDArray[np.uint8] | None = None
+    debris: npt.NDArray[np.uint8] | None = None
 
     __repr__ = short_repr
 
@@ -111,6 +126,11 @@ class RenderedView:
         return sum(highlight.isolated for highlight in self.highlights)
 
     @cached_property
+    def overlay(self) -> Mask | None:
+        """The pixels on which the processor draws, shape (H, W); None where it draws nothing."""
+        return drawn_over(self.scene.sensor.overlay, (self.camera.height, self.camera.width))
+
+    @cached_property
     def lobe(self) -> Image:
         """Mean of the channels of the lobe's direct light before the lens, shape (H, W)."""
         return mean_channel(self.radiance.specular)
@@ -128,7 +148,8 @@ class RenderedView:
     @cached_property
     def spots(self) -> VisibleSpots:
         """The pixels of the spots that can be seen in the noise-free frame, also of those on instruments."""
-        return find_spots(mean_channel(self._judged_light), mean_channel(self._specular), self.camera.seen)
+        seen = _shown(self.camera, self.overlay)
+        return find_spots(mean_channel(self._judged_light), mean_channel(self._specular), seen)
 
     @cached_property
     def visible_highlights(self) -> list[VisibleHighlight]:
@@ -136,7 +157,7 @@ class RenderedView:
         light, spots, sensor = self._judged_light, self.spots, self.scene.sensor
         sigma = noise_at(light, self.full_scale, sensor, spots.rows, spots.columns, FEW_DRAWS)
         clip = self.full_scale if sensor.clips else math.inf
-        seen = self.camera.seen
+        seen = _shown(self.camera, self.overlay)
         return describe(spots, light, self._specular, sigma, self.highlights, seen, self.instruments, clip)
 
     def frame(self, seed: int) -> Image:
@@ -229,7 +250,11 @@ def render_view(session: Session, scene: Scene, radiance: Radiance | None = None
     calibration = scene.calibration(brightest_mm(highlights))
     cover = session.cover()
     instruments = None if cover is None else cover.numbers
-    return RenderedView(scene, radiance, light, highlights, clouds, full_scale, calibration, instruments)
+    lying = session.lying(session.camera.pixel_centres().reshape(-1, 2))
+    debris = None if lying is None else lying.reshape(light.shape[:2]).astype(np.uint8)
+    if debris is not None and instruments is not None:
+        debris[instruments > 0] = 0
+    return RenderedView(scene, radiance, light, highlights, clouds, full_scale, calibration, instruments, debris)
 
 
 def brightest_mm(highlights: Sequence[TrueHighlight]) -> float | None:
@@ -293,6 +318,24 @@ def _direct(radiance: Radiance, light: Image, scene: Scene, camera: Camera) -> I
     return collect(radiance.specular + radiance.diffuse, scene.sensor, camera)
 
 
+def _shown(camera: Camera, overlay: Mask | None) -> Mask | None:
+    """Return the pixels of the view on which nothing is drawn; None where these are all."""
+    return camera.seen if overlay is None else ~overlay if camera.seen is None else camera.seen & ~overlay
+
+
+def _uncovered(session: Session, points: list[HighlightPoint], seen: Mask | None) -> tuple[list[HighlightPoint], Mask]:
+    """Return points, those hidden that stool or what is drawn, outside `seen`, covers; and which these are."""
+    pixels = np.array([point.bp_px for point in points]).reshape(-1, 2)
+    lying, covered = session.lying(pixels) if points else None, np.zeros(len(points), dtype=bool)
+    if lying is not None:
+        covered |= lying == STOOL
+    if seen is not None and points:
+        columns, rows = np.minimum(pixels.astype(int), [seen.shape[1] - 1, seen.shape[0] - 1]).T
+        covered |= ~seen[rows, columns]
+    hidden = [replace(p, lit=False, hidden=True) if over else p for p, over in zip(points, covered, strict=True)]
+    return hidden, covered
+
+
 def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) -> tuple[list[TrueHighlight], float]:
     """Judge a frame's highlights by its direct light behind the lens; return them and the full scale.
 
@@ -301,7 +344,11 @@ def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) ->
     camera = session.camera
     direct = _direct(radiance, light, scene, camera)
     points, rough = session.highlights(radiance), session.surface.relief is not None
-    examined = examine(points, mean_channel(direct), camera.seen, single=rough)
+    overlay = drawn_over(scene.sensor.overlay, direct.shape[:2])
+    seen = _shown(camera, overlay)
+    points, covered = _uncovered(session, points, None if overlay is None else ~overlay)
+    examined = examine(points, mean_channel(direct), seen, single=rough)
+    examined = [replace(e, why_not=COVERED) if over else e for e, over in zip(examined, covered, strict=True)]
     full_scale = _metered(scene, mean_channel(light), camera.seen)
     if full_scale is None:
         # Which highlights are isolated is judged without noise first.
@@ -320,8 +367,8 @@ def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) ->
     clip = full_scale if scene.sensor.clips else math.inf
     if direct.ndim == 3 and direct.max() > clip:
         # Tissue's red is clipped long before its green: each channel shows the height that is left to it.
-        limited = smooth(mean_channel(np.minimum(direct, np.float32(clip))), DEFAULT_SMOOTHING_PX, camera.seen)
-        examined = [each.clipped(limited, camera.seen) for each in examined]
+        limited = smooth(mean_channel(np.minimum(direct, np.float32(clip))), DEFAULT_SMOOTHING_PX, seen)
+        examined = [each.clipped(limited, seen) for each in examined]
     return verdicts(points, examined, sigmas, clip), full_scale
 
 

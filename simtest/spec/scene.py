@@ -64,6 +64,13 @@ class KnownSpec(Spec):
     )
 
 
+LATER = (
+    ("sensor", "fringe"), ("sensor", "interlacing"), ("sensor", "overlay", "insets"),
+    ("reflectance", "albedo", "debris"),
+)  # fmt: skip
+"""Keys that a scene without them is written without, as it was before there were any."""
+
+
 class Scene(Spec):
     """Everything that determines a rendered frame.
 
@@ -151,6 +158,12 @@ class Scene(Spec):
                 dumped.pop(name, None)
         if self.camera.moved is None:
             dumped.get("camera", {}).pop("moved", None)
+        for *tables, name in LATER:
+            table: Any = dumped
+            for key in tables:
+                table = (table or {}).get(key)
+            if table and not table.get(name):
+                table.pop(name, None)
         return dumped
 
     @property
@@ -164,7 +177,8 @@ class Scene(Spec):
         colours = [self.reflectance.colour, *(light.colour for light in self.rig.lights)]
         for instrument in self.shown_instruments.values():
             colours += [instrument.metal, instrument.colour]
-        return self.albedo is not None or any(len(set(colour)) > 1 for colour in colours)
+        painted = self.albedo is not None or self.sensor.fringe is not None
+        return painted or any(len(set(colour)) > 1 for colour in colours)
 
     def calibration(self, distance_mm: float | None = None) -> Calibration:
         """Return what reconstruction knows of the scene's camera, sensor, lights and surface.

@@ -63,6 +63,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 Gain = Annotated[float, Field(ge=0.05, le=20)]
+Stretch = Annotated[float, Field(ge=-0.01, le=0.01)]
+Shift = Annotated[float, Field(ge=-100, le=100)]
 Row = tuple[float, float, float]
 
 IDENTITY: tuple[Row, Row, Row] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -109,6 +111,16 @@ class ColourProcessing(Spec):
         return np.asarray(gains / gains.min())
 
 
+class Fringe(Spec):
+    """Lateral chromatic aberration: red and blue are larger or smaller than green, about the picture's centre.
+
+    Their light moves by a share of its distance from there, at most 1 %; the truth stays at the place of green.
+    """
+
+    red: Stretch = Field(0.002, description="by how much red is larger than green, share")
+    blue: Stretch = Field(-0.002, description="the same of blue")
+
+
 class Sharpening(Spec):
     """Unsharp masking of the encoded picture's luma: value + amount (value - value smoothed by a Gaussian).
 
@@ -126,6 +138,16 @@ class Scaling(Spec):
     method: Literal["linear", "cubic", "area", "lanczos"] = Field(
         "linear", description="how it is scaled back; towards a smaller size areas are averaged"
     )
+
+
+class Interlacing(Spec):
+    """A comb: the odd rows of the recorded picture are of a later moment, when the view has moved.
+
+    Of them alone light moves, by whole pixels next to what is asked for; the truth is that of the even rows.
+    """
+
+    shift_px: tuple[Shift, Shift] = Field((0.0, 0.0), description="how far they have moved to the right and down, px")
+    zoom: float = Field(1.0, ge=0.9, le=1.1, description="how they have grown about the centre: the camera advances")
 
 
 class Caption(Spec):
@@ -148,11 +170,25 @@ class Box(Spec):
     colour: tuple[Share, Share, Share] = Field((0.0, 0.0, 0.0), description="encoded red, green, blue")
 
 
+class Inset(Spec):
+    """The picture itself, small and mirrored, as a frozen frame beside the live one."""
+
+    x: Share = Field(description="left side, share of the width")
+    y: Share = Field(description="upper side, share of the height")
+    size: float = Field(0.25, ge=0.01, le=1, description="share of the width, and of the height")
+
+
 class Overlay(Spec):
     """What the processor draws into the picture; outside the camera's view mask it blanks the picture first."""
 
     captions: tuple[Caption, ...] = Field((), max_length=100)
     boxes: tuple[Box, ...] = Field((), max_length=100, description="drawn before the captions")
+    insets: tuple[Inset, ...] = Field((), max_length=10, description="drawn after the boxes, before the captions")
+
+    @property
+    def draws(self) -> bool:
+        """Whether it draws anything."""
+        return bool(self.captions or self.boxes or self.insets)
 
 
 class JpegCoding(Spec):
@@ -259,8 +295,8 @@ def _optional(model: type[Spec]) -> set[str]:
 class Sensor(Spec):
     """From radiance to a frame, in this order.
 
-    Point spread, vignetting, exposure, colour filter mosaic, noise, demosaicing, white balance and colour matrix,
-    saturation, response, sharpening, scaling, captions, quantisation, coding.
+    Point spread, vignetting, colour fringe, exposure, colour filter mosaic, noise, demosaicing, white balance and
+    colour matrix, saturation, response, sharpening, interlacing and scaling, captions, quantisation, coding.
     """
 
     preset: SensorPreset | None = Field(
@@ -287,7 +323,9 @@ class Sensor(Spec):
     bits: Bits | None = Field(None, description="of the values; default not quantised")
     mosaic: Mosaic | None = Field(None, description="default: each pixel measures all colours")
     colour: ColourProcessing | None = Field(None, description="default: the sensor's colours are the picture's")
+    fringe: Fringe | None = Field(None, description="colour fringe; default none")
     sharpening: Sharpening | None = Field(None, description="default none")
+    interlacing: Interlacing | None = Field(None, description="default none; px are of the recorded size, see scaling")
     scaling: Scaling | None = Field(None, description="default: recorded at the camera's size")
     overlay: Overlay | None = Field(None, description="default: nothing is drawn")
     coding: Coding | None = Field(None, description="lossy coding of the picture; needs bits = 8; default none")
@@ -332,7 +370,8 @@ class Sensor(Spec):
     @property
     def is_processed(self) -> bool:
         """Whether the picture goes through stages behind the response, which change neighbouring pixels."""
-        return any(stage is not None for stage in (self.sharpening, self.scaling, self.overlay, self.coding))
+        stages = (self.sharpening, self.interlacing, self.scaling, self.overlay, self.coding)
+        return any(stage is not None for stage in stages)
 
     @property
     def encodes(self) -> bool:
