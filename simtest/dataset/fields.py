@@ -7,7 +7,7 @@ smooth maps of 16 bits.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from io import BytesIO
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -48,9 +48,9 @@ class Field:
     unit: str
     meaning: str  # what it holds, with frame and sign
     codec: Codec  # how the member holds it
-    # which samples store it: all, those with a relief, with listed instruments, with debris or with something drawn, or
-    # those of datasets that ask for it, by a key of its name
-    stored: Literal["always", "relief", "instruments", "debris", "overlay", "asked"] = "always"
+    # which samples store it: all, those with a relief, with listed instruments or with what covers tissue, or those of
+    # datasets that ask for it, by a key of its name
+    stored: Literal["always", "relief", "instruments", "covered", "asked"] = "always"
     # what it is where that says no: the field of this name, or this number everywhere
     otherwise: str | int | None = None
 
@@ -60,18 +60,9 @@ class Field:
             "always": True,
             "relief": has_relief(meta),
             "instruments": bool(meta["scene"].get("instruments")),
-            "debris": bool(_told(meta, "reflectance", "albedo", "debris")),
-            "overlay": any(_told(meta, "sensor", "overlay").values()),
+            "covered": False,
             "asked": False,
         }[self.stored]
-
-
-def _told(meta: SampleMeta, *path: str) -> dict[str, Any]:
-    """Return a table of a sample's scene, empty where it has none."""
-    table: Any = meta["scene"]
-    for key in path:
-        table = table.get(key) or {}
-    return dict(table)
 
 
 # Depth ---------------------------------------------------------------------------------------------------------------
@@ -250,8 +241,8 @@ CURVATURES = Codec(
     _decode_curvature,
 )
 
-INSTRUMENT, VISIBLE, DEBRIS, OVERLAY = "instrument", "visible", "debris", "overlay"
-"""Fields of the pixels of instruments, of visible highlights, of what lies on tissue and of what is drawn."""
+INSTRUMENT, VISIBLE, COVERING = "instrument", "visible", "covering"
+"""Fields of the pixels of instruments, of visible highlights, and of what covers tissue."""
 
 FIELDS = (
     Field("image", "image.png", "(H, W, 3)", "uint8", "sensor counts",
@@ -294,12 +285,9 @@ FIELDS = (
           "0, or 1 + the index in the scene's instruments of the metal instrument that is seen: depth and normals "
           "are its own there, curvature is NaN; stored where the scene lists instruments, elsewhere it is 0 everywhere",
           PICTURE, "instruments", 0),
-    Field(DEBRIS, "debris.png", "(H, W)", "uint8", "1",
-          "what lies on the tissue: 1 stool, 2 bile, 0 nothing; stored where the scene has debris, elsewhere it is 0",
-          PICTURE, DEBRIS, 0),
-    Field(OVERLAY, "overlay.png", "(H, W)", "bool", "1",
-          "where captions, boxes and insets are drawn; stored where the scene has any, elsewhere it is false",
-          replace(MASK, text="8-bit PNG; 255: drawn, 0: none"), OVERLAY, 0),
+    Field(COVERING, "covering.png", "(H, W)", "uint8", "1",
+          "what covers the tissue: 1 stool, 2 bile, 3 text, boxes and insets, 0 nothing; stored where a scene has any",
+          PICTURE, "covered", 0),
     Field("radiance", "radiance.npy", "(H, W, 3)", "float16", "full scale",
           "linear radiance before lens and noise, share of full scale; only in datasets that keep it", HALF, "asked"),
 )  # fmt: skip

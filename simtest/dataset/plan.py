@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pydantic import JsonValue
 
-from simtest.dataset.fields import DEBRIS, FIELDS, OVERLAY, Field
+from simtest.dataset.fields import FIELDS, Field
 from simtest.errors import InputError
 from simtest.runtime.arrays import IntArray
 from simtest.runtime.resources import find
@@ -85,8 +85,7 @@ class Plan:
         # Samples hold the truth of the base as well, or a map of the instruments.
         self.has_relief = any(scene.surface.relief is not None for scene in scenes)
         self.has_instruments = any(scene.instruments for scene in scenes)
-        self._has_debris = any(scene.albedo is not None and scene.albedo.debris is not None for scene in scenes)
-        self._has_overlay = any(scene.sensor.overlay is not None and scene.sensor.overlay.draws for scene in scenes)
+        self._is_covered = any(scene.is_covered for scene in scenes)
         self._check_shared()
         self.splits, self.samples_per_anatomy = _made_small(dataset)
         self._blocks = self._lay_out()
@@ -114,7 +113,7 @@ class Plan:
     def fields(self) -> list[Field]:
         """The fields that some sample stores."""
         stored = {"always": True, "relief": self.has_relief, "instruments": self.has_instruments}
-        stored |= {DEBRIS: self._has_debris, OVERLAY: self._has_overlay}
+        stored["covered"] = self._is_covered
         return [field for field in FIELDS if stored.get(field.stored, getattr(self.dataset, field.name, False))]
 
     def _base(self, number: int, family: Family) -> dict[str, Any]:

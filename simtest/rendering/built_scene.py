@@ -117,7 +117,7 @@ class BuiltScene:
         kernel = weakref.proxy(albedo)
         bsdf, has_debris = self.scene.shapes()[0].bsdf(), albedo.pattern.debris is not None
         bsdf.albedo_at = lambda si, active: kernel.of(si, active)
-        bsdf.bare_at = (lambda si, active: kernel.bare(si, active)) if has_debris else None
+        bsdf.bare_at = (lambda si, active: 1 - kernel.covers(si, active)[0]) if has_debris else None
 
     def _set(self, suffix: str, value: Any) -> None:
         """Assign the one parameter whose path ends in `suffix`; Mitsuba names paths by its own rules."""

@@ -109,7 +109,7 @@ class Material:
         albedo = self.albedo.of(hit.base, valid)
         self.bsdf.albedo_at = lambda si, active: albedo
         if self.albedo.pattern.debris is not None:
-            bare = self.albedo.bare(hit.base, valid)
+            bare = 1 - self.albedo.covers(hit.base, valid)[0]
             self.bsdf.bare_at = lambda si, active: bare
         try:
             yield

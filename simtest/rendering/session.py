@@ -305,12 +305,15 @@ class Session:
         return self._cover
 
     @_at_its_variant
-    def lying(self, points_px: Array) -> IntArray | None:
-        """Return what lies on tissue at pixel positions, shape (N, 2): `STOOL`, `BILE` or 0; None without debris."""
-        if self._pattern is None or self._pattern.debris is None or self._albedo is None:
+    def debris(self) -> Image | None:
+        """Return the shares that stool and bile cover at the pixels' centres, shape (2, H, W); None without debris."""
+        if self._albedo is None or self._albedo.pattern.debris is None:
             return None
-        hit = self._tracer().hit(*(to_kernel(mi.Float, axis, np.float32) for axis in points_px.T))[2]
-        return evaluate([self._albedo.lying(hit.base)], len(points_px))[0].astype(np.int64)
+        pixels = np.moveaxis(self.camera.pixel_centres(), 2, 0)
+        base = self._tracer().hit(*(to_kernel(mi.Float, axis.ravel(), np.float32) for axis in pixels))[2].base
+        shares = evaluate([*self._albedo.covers(base, base.is_valid())], pixels[0].size)
+        covers, cover = np.reshape(shares, pixels.shape), self.cover()
+        return covers if cover is None else np.where(cover.seen, np.float32(0), covers)
 
     # Truth -------------------------------------------------------------------------------------------------------
 

@@ -196,10 +196,6 @@ TURN, PER_MM, MASK, ROWS, HALF = 32, 50, 51, 52, 53
 beyond which vessels are mirrored."""
 
 
-STOOL, BILE = 1, 2
-"""What lies on tissue, in labels; 0 where nothing does."""
-
-
 class AlbedoKernel:
     """Evaluates the albedo of tissue; of a deformed surface `rest` says where the tissue was.
 
@@ -216,7 +212,7 @@ class AlbedoKernel:
         self._is_mirrored = bool((table.half_mm < ENDLESS).any())
         first = np.zeros(-(-len(table.first) // PACKET) * PACKET, dtype=np.float32)
         first.view(np.uint32)[: len(table.first)] = table.first
-        debris = [] if pattern.debris is None else [pattern.debris.numbers, _packets(pattern.debris.field)]
+        debris = [] if (own := pattern.debris) is None else [own.numbers.astype(np.float32), _packets(own.field)]
         parts = [_header(pattern), *(_packets(lattice) for lattice in lattices), *debris, first, table.rows.ravel()]
         # The sizes of all but the last two are the same for all patterns.
         self._lattices = [sum(map(len, parts[: 1 + i])) // PACKET for i in range(len(lattices))]
@@ -247,21 +243,16 @@ class AlbedoKernel:
             return mi.Spectrum(*colour)
         return mi.Spectrum(mi.luminance(mi.Color3f(*colour)))
 
-    def bare(self, si: Any, active: Any) -> Any:
-        """Compute the share of the lobe, mitsuba.Float, that stool leaves at surface points."""
-        return 1 - self._covers(self._rest_point(si, active), active)[0]
-
-    def lying(self, si: Any) -> Any:
-        """Compute what lies on tissue at surface points: `STOOL`, `BILE` or 0, mitsuba.Float."""
-        active = si.is_valid()
+    def covers(self, si: Any, active: Any) -> tuple[Any, Any]:
+        """Compute the shares that stool and bile cover, mitsuba.Float, at surface points (`DebrisPattern`)."""
         stool, bile, _ = self._covers(self._rest_point(si, active), active)
-        return dr.select(active & (stool > 0.5), mi.Float(STOOL), dr.select(active & (bile > 0.5), mi.Float(BILE), 0))
+        return dr.select(active, stool, 0), dr.select(active, bile, 0)
 
     def _rest_point(self, si: Any, active: Any) -> Any:
         return si.p if self.rest is None else self.rest.point(si, active)
 
     def _covers(self, p: Any, active: Any) -> tuple[Any, Any, list[Any]]:
-        """Compute the shares of stool and bile; see `DebrisPattern.covers`, which gives the numbers too."""
+        """Compute the shares of `covers` at points at rest; return the pattern's other numbers too."""
         numbers = [self._number(self._debris + i) for i in range(9, 20)]
         field = self._lattice(self._debris, self._debris // PACKET + 5, mi.Vector3f(p), active)
         high, low, sharpness = numbers[:3]
@@ -269,7 +260,7 @@ class AlbedoKernel:
         return stool, bile, numbers[3:]
 
     def _soiled(self, albedo: list[Any], p: Any, active: Any) -> list[Any]:
-        """Lay debris over an albedo; see `DebrisPattern.over`."""
+        """Lay debris over an albedo, by channel."""
         stool, bile, (lumps, scale, *colours) = self._covers(p, active)
         matter = dr.exp(-lumps * self._lattice(self._debris, self._debris // PACKET + 5, scale * p, active))
         return [

@@ -22,7 +22,6 @@ from simtest.errors import InputError
 from simtest.geometry import Camera, smooth
 from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
 from simtest.rendering.highlights import radii_px
-from simtest.rendering.tissue_kernels import STOOL
 from simtest.runtime.arrays import Array, Image, Mask, short_repr
 from simtest.runtime.files import as_path
 from simtest.runtime.seeds import from_integer
@@ -38,15 +37,7 @@ from simtest.simulation.highlights import (
     find_spots,
     verdicts,
 )
-from simtest.simulation.sensor import (
-    capture,
-    check_codec,
-    collect,
-    drawn_over,
-    full_scale_of_average,
-    noise_at,
-    to_uint8,
-)
+from simtest.simulation.sensor import capture, check_codec, collect, full_scale_of_average, noise_at, overlaid, to_uint8
 from simtest.spec import Scene
 
 DARK_SHARE = 1e-12
@@ -59,8 +50,8 @@ DEAR_SAMPLES = 16
 """With so many samples a pixel or fewer, a frame with a source of finite size costs no more than its quick look. A part
 of what a dataset's seed means: another number keeps other draws."""
 
-COVERED = "covered by stool or by what is drawn"
-"""Why a highlight point is none that can be seen."""
+STOOL, BILE, DRAWN, COVERED = 1, 2, 3, "covered by stool or by what is drawn"
+"""What may cover tissue, and why a point below the first or the last is no isolated highlight."""
 
 TISSUE = np.array([0.55, 0.27, 0.22], dtype=np.float32)
 """Colour of a surface that has none of its own, linear."""
@@ -94,8 +85,8 @@ class RenderedView:
         What reconstruction is told.
     instruments : ndarray of uint8, shape (H, W), or None
         1 + the index of the instrument that is seen, 0 where none is; None in a scene without instruments.
-    debris : ndarray of uint8, shape (H, W), or None
-        What lies on the tissue at each pixel's centre: 1 stool, 2 bile, 0 nothing; None in a scene without debris.
+    covering : ndarray of uint8, shape (H, W), or None
+        What covers the tissue: 1 stool, 2 bile, 3 what is drawn, 0 nothing; None in a scene without any.
     """
 
     scene: Scene
@@ -106,7 +97,7 @@ class RenderedView:
     full_scale: float
     calibration: Calibration
     instruments: npt.NDArray[np.uint8] | None = None
-    debris: npt.NDArray[np.uint8] | None = None
+    covering: npt.NDArray[np.uint8] | None = None
 
     __repr__ = short_repr
 
@@ -126,11 +117,6 @@ class RenderedView:
         return sum(highlight.isolated for highlight in self.highlights)
 
     @cached_property
-    def overlay(self) -> Mask | None:
-        """The pixels on which the processor draws, shape (H, W); None where it draws nothing."""
-        return drawn_over(self.scene.sensor.overlay, (self.camera.height, self.camera.width))
-
-    @cached_property
     def lobe(self) -> Image:
         """Mean of the channels of the lobe's direct light before the lens, shape (H, W)."""
         return mean_channel(self.radiance.specular)
@@ -148,7 +134,7 @@ class RenderedView:
     @cached_property
     def spots(self) -> VisibleSpots:
         """The pixels of the spots that can be seen in the noise-free frame, also of those on instruments."""
-        seen = _shown(self.camera, self.overlay)
+        seen = _undrawn(self.camera, self.covering)
         return find_spots(mean_channel(self._judged_light), mean_channel(self._specular), seen)
 
     @cached_property
@@ -157,7 +143,7 @@ class RenderedView:
         light, spots, sensor = self._judged_light, self.spots, self.scene.sensor
         sigma = noise_at(light, self.full_scale, sensor, spots.rows, spots.columns, FEW_DRAWS)
         clip = self.full_scale if sensor.clips else math.inf
-        seen = _shown(self.camera, self.overlay)
+        seen = _undrawn(self.camera, self.covering)
         return describe(spots, light, self._specular, sigma, self.highlights, seen, self.instruments, clip)
 
     def frame(self, seed: int) -> Image:
@@ -250,11 +236,9 @@ def render_view(session: Session, scene: Scene, radiance: Radiance | None = None
     calibration = scene.calibration(brightest_mm(highlights))
     cover = session.cover()
     instruments = None if cover is None else cover.numbers
-    lying = session.lying(session.camera.pixel_centres().reshape(-1, 2))
-    debris = None if lying is None else lying.reshape(light.shape[:2]).astype(np.uint8)
-    if debris is not None and instruments is not None:
-        debris[instruments > 0] = 0
-    return RenderedView(scene, radiance, light, highlights, clouds, full_scale, calibration, instruments, debris)
+    return RenderedView(
+        scene, radiance, light, highlights, clouds, full_scale, calibration, instruments, _covering(session, scene)
+    )
 
 
 def brightest_mm(highlights: Sequence[TrueHighlight]) -> float | None:
@@ -318,22 +302,31 @@ def _direct(radiance: Radiance, light: Image, scene: Scene, camera: Camera) -> I
     return collect(radiance.specular + radiance.diffuse, scene.sensor, camera)
 
 
-def _shown(camera: Camera, overlay: Mask | None) -> Mask | None:
+def _covering(session: Session, scene: Scene) -> npt.NDArray[np.uint8] | None:
+    """Return what covers the tissue (`RenderedView.covering`)."""
+    if not scene.is_covered:
+        return None
+    covering = np.zeros((session.camera.height, session.camera.width), dtype=np.uint8)
+    if (shares := session.debris()) is not None:
+        covering[shares[1] > 0.5] = BILE
+        covering[shares[0] > 0.5] = STOOL
+    if scene.sensor.overlay is not None:
+        covering[overlaid(scene.sensor.overlay, covering.shape)] = DRAWN
+    return covering
+
+
+def _undrawn(camera: Camera, covering: npt.NDArray[np.uint8] | None) -> Mask | None:
     """Return the pixels of the view on which nothing is drawn; None where these are all."""
-    return camera.seen if overlay is None else ~overlay if camera.seen is None else camera.seen & ~overlay
+    drawn = None if covering is None else covering != DRAWN
+    return camera.seen if drawn is None else drawn if camera.seen is None else camera.seen & drawn
 
 
-def _uncovered(session: Session, points: list[HighlightPoint], seen: Mask | None) -> tuple[list[HighlightPoint], Mask]:
-    """Return points, those hidden that stool or what is drawn, outside `seen`, covers; and which these are."""
-    pixels = np.array([point.bp_px for point in points]).reshape(-1, 2)
-    lying, covered = session.lying(pixels) if points else None, np.zeros(len(points), dtype=bool)
-    if lying is not None:
-        covered |= lying == STOOL
-    if seen is not None and points:
-        columns, rows = np.minimum(pixels.astype(int), [seen.shape[1] - 1, seen.shape[0] - 1]).T
-        covered |= ~seen[rows, columns]
-    hidden = [replace(p, lit=False, hidden=True) if over else p for p, over in zip(points, covered, strict=True)]
-    return hidden, covered
+def _is_covered(point: HighlightPoint, covering: npt.NDArray[np.uint8] | None) -> bool:
+    """Return whether stool or what is drawn covers the pixel of a point."""
+    if covering is None:
+        return False
+    column, row = np.minimum(point.bp_px.astype(int), [covering.shape[1] - 1, covering.shape[0] - 1])
+    return covering[row, column] not in (0, BILE)
 
 
 def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) -> tuple[list[TrueHighlight], float]:
@@ -344,9 +337,9 @@ def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) ->
     camera = session.camera
     direct = _direct(radiance, light, scene, camera)
     points, rough = session.highlights(radiance), session.surface.relief is not None
-    overlay = drawn_over(scene.sensor.overlay, direct.shape[:2])
-    seen = _shown(camera, overlay)
-    points, covered = _uncovered(session, points, None if overlay is None else ~overlay)
+    covering = _covering(session, scene)
+    seen, covered = _undrawn(camera, covering), [_is_covered(point, covering) for point in points]
+    points = [replace(p, lit=False, hidden=True) if over else p for p, over in zip(points, covered, strict=True)]
     examined = examine(points, mean_channel(direct), seen, single=rough)
     examined = [replace(e, why_not=COVERED) if over else e for e, over in zip(examined, covered, strict=True)]
     full_scale = _metered(scene, mean_channel(light), camera.seen)

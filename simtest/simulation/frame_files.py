@@ -60,12 +60,6 @@ INSTRUMENT_FIELDS = {
 }
 """Further fields of a scene with instruments."""
 
-COVER_FIELDS = {
-    "debris": "what lies on the tissue: 1 stool, whose points in highlights are hidden, 2 bile, 0 nothing",
-    "overlay": "where the processor draws captions, boxes and insets; highlights below them are hidden",
-}
-"""Further fields of a scene with debris, and with something drawn."""
-
 SHEET_WIDTH, SHEET_COLUMNS = 1600, 10
 """Of a sheet of pictures: its width, px, and how many stand side by side."""
 
@@ -164,7 +158,7 @@ def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
         "pool": truth.pool,
         "mask": truth.mask,
         **({"instrument": truth.instrument} if frame.scene.shown_instruments else {}),
-        **{name: covers for name in COVER_FIELDS if (covers := getattr(frame, name)) is not None},
+        **({} if frame.covering is None else {"covering": frame.covering}),
     }
 
 
@@ -178,7 +172,8 @@ def _description(frame: LabelledFrame) -> Json:
         "world_from_camera": frame.world_from_camera.tolist(),
     }
     fields: dict[str, Json] = {**FIELDS, **(INSTRUMENT_FIELDS if scene.shown_instruments else {})}
-    fields |= {name: meaning for name, meaning in COVER_FIELDS.items() if getattr(frame, name) is not None}
+    if frame.covering is not None:
+        fields["covering"] = "what covers tissue: 1 stool, 2 bile, 3 what is drawn; highlights below 1 and 3 are hidden"
     if sensor.encodes:
         fields["frame.png"] = "the sensor's own values, as encoding says; the largest is full scale"
         response = sensor.response.model_dump(mode="json")

@@ -25,7 +25,6 @@ from simtest.spec.sensor import (
     Caption,
     Coding,
     ColourProcessing,
-    Fringe,
     H264Coding,
     Inset,
     Interlacing,
@@ -132,8 +131,9 @@ def capture(
     ValueError
         If noise is asked for without a generator.
     """
-    if sensor.fringe is not None:
-        light = fringed(light, sensor.fringe)
+    if sensor.fringe is not None and light.ndim == 3:
+        scales = (1 + sensor.fringe.red, 1.0, 1 + sensor.fringe.blue)
+        light = np.asarray(cv2.merge([_moved(light[..., i], scale) for i, scale in enumerate(scales)]))
     # The sensor's own colours, each pixel behind its filter.
     if sensor.colour is not None or sensor.mosaic is not None:
         light, full_scale = expose(light, full_scale, 0.0, None), 1.0
@@ -371,14 +371,6 @@ def sharpen(picture: Image, sharpening: Sharpening) -> Image:
     return np.asarray(cv2.add(picture, change if picture.ndim == 2 else cv2.merge([change] * 3)))
 
 
-def fringed(light: Image, fringe: Fringe) -> Image:
-    """Return light whose red and blue are scaled about the centre; grey light, shape (H, W), has no colours."""
-    if light.ndim == 2:
-        return light
-    scales = (1 + fringe.red, 1.0, 1 + fringe.blue)
-    return np.asarray(cv2.merge([_moved(light[..., i], scale) for i, scale in enumerate(scales)]))
-
-
 def weave(picture: Image, interlacing: Interlacing) -> Image:
     """Return a recorded picture whose odd rows are those of the moved view; whole pixels keep the noise as it is."""
     woven = picture.copy()
@@ -417,7 +409,7 @@ def draw(picture: Image, overlay: Overlay, seen: Mask | None) -> Image:
     for inset in overlay.insets:
         part = drawn[_area(inset, size)]
         if part.size:
-            part[...] = cv2.resize(cv2.flip(live, 1), part.shape[1::-1], interpolation=cv2.INTER_AREA)
+            part[:] = cv2.resize(cv2.flip(live, 1), part.shape[1::-1], interpolation=cv2.INTER_AREA)
     for caption in overlay.captions:
         cover = _cover(caption, size)
         cover = cover if drawn.ndim == 2 else cover[..., None]
@@ -425,10 +417,8 @@ def draw(picture: Image, overlay: Overlay, seen: Mask | None) -> Image:
     return drawn
 
 
-def drawn_over(overlay: Overlay | None, size: tuple[int, int]) -> Mask | None:
-    """Return the pixels, shape (H, W), that boxes, insets and captions cover or touch; None where there are none."""
-    if overlay is None or not overlay.draws:
-        return None
+def overlaid(overlay: Overlay, size: tuple[int, int]) -> Mask:
+    """Return the pixels, shape (H, W), that boxes, insets and captions cover or touch."""
     over = np.zeros(size, dtype=bool)
     for part in (*overlay.boxes, *overlay.insets):
         over[_area(part, size)] = True
@@ -439,10 +429,9 @@ def drawn_over(overlay: Overlay | None, size: tuple[int, int]) -> Mask | None:
 
 def _area(part: Box | Inset, size: tuple[int, int]) -> tuple[slice, slice]:
     """Return the rows and columns of a rectangle."""
-    height, width = size
-    down, across = (part.height, part.width) if isinstance(part, Box) else (part.size, part.size)
-    rows = slice(round(part.y * height), round((part.y + down) * height))
-    return rows, slice(round(part.x * width), round((part.x + across) * width))
+    starts, ends = (part.y, part.x), (part.y + part.height, part.x + part.width)
+    rows, columns = (slice(round(a * n), round(b * n)) for a, b, n in zip(starts, ends, size, strict=True))
+    return rows, columns
 
 
 def _paint(colour: tuple[float, float, float], picture: Image) -> Image:

@@ -19,7 +19,7 @@ from simtest.spec.camera_formats.common import read_json
 from simtest.spec.keys import replace_values
 from simtest.spec.lights import Rig
 from simtest.spec.reflectance import PhongReflectance, Reflectance, TissueColour, TissueReflectance, Translucency
-from simtest.spec.sensor import Sensor
+from simtest.spec.sensor import Overlay, Sensor
 from simtest.spec.spec_model import Millimetres, Spec, validate
 from simtest.spec.surfaces import MOST_DEFORMATIONS, Deformation, Instrument, Surface
 from simtest.spec.toml_files import as_settings, read_toml, source_name
@@ -62,13 +62,6 @@ class KnownSpec(Spec):
     distance_sd: float = Field(
         0.0, ge=0, le=10, description="standard deviation that they are told, share of the told distance"
     )
-
-
-LATER = (
-    ("sensor", "fringe"), ("sensor", "interlacing"), ("sensor", "overlay", "insets"),
-    ("reflectance", "albedo", "debris"),
-)  # fmt: skip
-"""Keys that a scene without them is written without, as it was before there were any."""
 
 
 class Scene(Spec):
@@ -158,12 +151,6 @@ class Scene(Spec):
                 dumped.pop(name, None)
         if self.camera.moved is None:
             dumped.get("camera", {}).pop("moved", None)
-        for *tables, name in LATER:
-            table: Any = dumped
-            for key in tables:
-                table = (table or {}).get(key)
-            if table and not table.get(name):
-                table.pop(name, None)
         return dumped
 
     @property
@@ -179,6 +166,12 @@ class Scene(Spec):
             colours += [instrument.metal, instrument.colour]
         painted = self.albedo is not None or self.sensor.fringe is not None
         return painted or any(len(set(colour)) > 1 for colour in colours)
+
+    @property
+    def is_covered(self) -> bool:
+        """Whether debris lies on the tissue, or something is drawn over it."""
+        drawn = self.sensor.overlay or Overlay()
+        return bool(drawn.captions or drawn.boxes or drawn.insets or (self.albedo and self.albedo.debris))
 
     def calibration(self, distance_mm: float | None = None) -> Calibration:
         """Return what reconstruction knows of the scene's camera, sensor, lights and surface.

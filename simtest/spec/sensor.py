@@ -10,7 +10,7 @@ from simtest.calibration import NoiseModel, Response
 from simtest.calibration.photometry import check_table
 from simtest.runtime.arrays import Array
 from simtest.spec.lights import CosineProfile, Profile
-from simtest.spec.spec_model import Share, Spec, with_preset
+from simtest.spec.spec_model import UNSAID, Share, Spec, with_preset
 
 SensorPreset = Literal["colonoscope_hd", "laparoscope_hd", "old_sd"]
 
@@ -63,7 +63,6 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 Gain = Annotated[float, Field(ge=0.05, le=20)]
-Stretch = Annotated[float, Field(ge=-0.01, le=0.01)]
 Shift = Annotated[float, Field(ge=-100, le=100)]
 Row = tuple[float, float, float]
 
@@ -112,13 +111,10 @@ class ColourProcessing(Spec):
 
 
 class Fringe(Spec):
-    """Lateral chromatic aberration: red and blue are larger or smaller than green, about the picture's centre.
+    """Lateral chromatic aberration: red and blue are scaled about the centre; the truth stays at the place of green."""
 
-    Their light moves by a share of its distance from there, at most 1 %; the truth stays at the place of green.
-    """
-
-    red: Stretch = Field(0.002, description="by how much red is larger than green, share")
-    blue: Stretch = Field(-0.002, description="the same of blue")
+    red: float = Field(0.002, ge=-0.01, le=0.01, description="by how much red is larger than green, share")
+    blue: float = Field(-0.002, ge=-0.01, le=0.01, description="the same of blue")
 
 
 class Sharpening(Spec):
@@ -141,10 +137,7 @@ class Scaling(Spec):
 
 
 class Interlacing(Spec):
-    """A comb: the odd rows of the recorded picture are of a later moment, when the view has moved.
-
-    Of them alone light moves, by whole pixels next to what is asked for; the truth is that of the even rows.
-    """
+    """A comb: odd rows, at the recorded size, show a view that has moved, by whole px; the truth is of the even ones."""
 
     shift_px: tuple[Shift, Shift] = Field((0.0, 0.0), description="how far they have moved to the right and down, px")
     zoom: float = Field(1.0, ge=0.9, le=1.1, description="how they have grown about the centre: the camera advances")
@@ -160,22 +153,21 @@ class Caption(Spec):
     colour: tuple[Share, Share, Share] = Field((1.0, 1.0, 1.0), description="encoded red, green, blue")
 
 
-class Box(Spec):
-    """A filled rectangle, as the inset of a position display."""
-
+class _Rectangle(Spec):
     x: Share = Field(description="left side, share of the width")
     y: Share = Field(description="upper side, share of the height")
     width: Share = Field(description="share of the width")
     height: Share = Field(description="share of the height")
+
+
+class Box(_Rectangle):
+    """A filled rectangle, as the ground of a position display."""
+
     colour: tuple[Share, Share, Share] = Field((0.0, 0.0, 0.0), description="encoded red, green, blue")
 
 
-class Inset(Spec):
+class Inset(_Rectangle):
     """The picture itself, small and mirrored, as a frozen frame beside the live one."""
-
-    x: Share = Field(description="left side, share of the width")
-    y: Share = Field(description="upper side, share of the height")
-    size: float = Field(0.25, ge=0.01, le=1, description="share of the width, and of the height")
 
 
 class Overlay(Spec):
@@ -183,12 +175,7 @@ class Overlay(Spec):
 
     captions: tuple[Caption, ...] = Field((), max_length=100)
     boxes: tuple[Box, ...] = Field((), max_length=100, description="drawn before the captions")
-    insets: tuple[Inset, ...] = Field((), max_length=10, description="drawn after the boxes, before the captions")
-
-    @property
-    def draws(self) -> bool:
-        """Whether it draws anything."""
-        return bool(self.captions or self.boxes or self.insets)
+    insets: tuple[Inset, ...] = Field((), max_length=10, description="drawn after the boxes", **UNSAID)
 
 
 class JpegCoding(Spec):
@@ -323,9 +310,9 @@ class Sensor(Spec):
     bits: Bits | None = Field(None, description="of the values; default not quantised")
     mosaic: Mosaic | None = Field(None, description="default: each pixel measures all colours")
     colour: ColourProcessing | None = Field(None, description="default: the sensor's colours are the picture's")
-    fringe: Fringe | None = Field(None, description="colour fringe; default none")
+    fringe: Fringe | None = Field(None, description="colour fringe; default none", **UNSAID)
     sharpening: Sharpening | None = Field(None, description="default none")
-    interlacing: Interlacing | None = Field(None, description="default none; px are of the recorded size, see scaling")
+    interlacing: Interlacing | None = Field(None, description="default none", **UNSAID)
     scaling: Scaling | None = Field(None, description="default: recorded at the camera's size")
     overlay: Overlay | None = Field(None, description="default: nothing is drawn")
     coding: Coding | None = Field(None, description="lossy coding of the picture; needs bits = 8; default none")

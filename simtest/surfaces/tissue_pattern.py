@@ -5,7 +5,7 @@
 for each channel c. g is the mottling, a periodic random field of space of unit deviation; n the capillaries' net, from
 0 to 1; a_c and b_c follow the root of blood's absorption, as the reflectance of a scattering medium does. L is the
 chord through a vessel (Beer and Lambert), mu_c the absorption of its blood, and s_c = exp(-depth / reach_c) the share
-of the light that comes back from below the vessel's depth. Debris lies above: bile absorbs, stool hides.
+of the light that comes back from below the vessel's depth. The kernel lays debris over it.
 """
 
 import math
@@ -14,7 +14,6 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -99,17 +98,10 @@ WALL = 0.1
 BLUR_PER_DEPTH = 0.4
 """Standard deviation of the blur of a vessel's edge over its depth."""
 
-RAGGED = 1.2
-"""By this power of the wave number the waves of debris are weaker than of one scale: smooth patches, ragged edges."""
-
-EDGE = 0.15
-"""Width of the edges of debris, deviations of its field."""
-
-LUMPS, LUMP_SCALE = 0.25, 5.0
-"""Standard deviation of the absorbance of stool, and how much smaller its lumps are than its patches."""
-
-BILE = (0.12, 0.05, 1.0)
-"""Absorbances of bile over that in blue; chosen by eye beside public frames."""
+RAGGED, EDGE, LUMPS, LUMP_SCALE, BILE = 1.2, 0.15, 0.25, 5.0, np.array([0.12, 0.05, 1.0])
+"""Of debris, by eye: power of the wave number by which its short waves are weaker; width of its edges, deviations;
+deviation of the absorbance of stool's lumps, and how much smaller than its patches they are; bile's absorbance over
+that in blue."""
 
 
 @dataclass(frozen=True)
@@ -127,29 +119,14 @@ class Lattice:
 
 @dataclass(frozen=True)
 class DebrisPattern:
-    """What lies on one surface's tissue: stool where a field is high, bile where it is low."""
+    """What lies on one surface's tissue: stool where a field f is above a level, bile where -f is above another.
+
+    Each covers the share 1/2 + (f - level) / EDGE, from 0 to 1. Bile absorbs; stool hides, with an albedo of
+    exp(-LUMPS f(LUMP_SCALE p)) times its colour.
+    """
 
     field: Lattice
-    levels: Array  # (2,): of the field, and of its negative, above which stool and bile lie; infinite: none
-    stool: Array  # (3,): albedo
-    bile: Array  # (3,): absorbance
-
-    @property
-    def numbers(self) -> npt.NDArray[np.float32]:
-        """What the kernel puts before the lattice: its turn, levels, sharpness, lumps and their scale, colours."""
-        turn, row = self.field.lattice_from_model.ravel(), (1 / EDGE, LUMPS, LUMP_SCALE)
-        return np.concatenate([turn, self.levels, row, self.stool, self.bile]).astype(np.float32)
-
-    def covers(self, points: Array) -> Array:
-        """Return the shares of stool and of bile, shape (2, N); where one is above a half its mask is set."""
-        field = self.field.at(points)
-        return np.asarray(np.clip(0.5 + (np.stack([field, -field]) - self.levels[:, None]) / EDGE, 0, 1))
-
-    def over(self, albedo: Array, points: Array) -> Array:
-        """Return the albedo with what lies on it."""
-        stool, bile = self.covers(points)[..., None]
-        lumps = self.stool * np.exp(-LUMPS * self.field.at(LUMP_SCALE * points))[:, None]
-        return np.asarray((1 - stool) * albedo * np.exp(-bile * self.bile) + stool * lumps)
+    numbers: Array  # (20,): turn, levels, 1 / EDGE, LUMPS, LUMP_SCALE, albedo of stool, absorbance of bile
 
 
 @dataclass(frozen=True)
@@ -168,13 +145,12 @@ class TissuePattern:
     debris: DebrisPattern | None = None
 
     def albedo(self, points: Array) -> Array:
-        """Return the albedo at points of the surface, model frame, mm, linear RGB; the kernel's slow reference."""
+        """Return the albedo below debris at points, model frame, mm, linear RGB; the kernel's slow reference."""
         field, net = self.mottling.at(points), self.capillaries.at(points)
         value = self.base * np.exp(-field[:, None] * self.mottled - net[:, None] * self.netted)
         chords = self.vessels.chords(points)
         for kind in range(2):
             value = value * (1 - self.share * -np.expm1(-chords[:, kind, None] * self.absorption[kind]))
-        value = value if self.debris is None else self.debris.over(value, points)
         return np.asarray(np.clip(value, 0, 1))
 
 
@@ -194,15 +170,16 @@ def make_pattern(surface: SurfaceModel, spec: TissueColour) -> TissuePattern:
 
 @remembered
 def _debris(spec: TissueColour) -> DebrisPattern:
-    """Draw what lies on tissue; its shares of space are exact."""
+    """Draw what lies on tissue; of space its shares are exact."""
     assert spec.debris is not None
     told, k0 = spec.debris, 2 * np.pi / MOTTLING_NODES
     rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(spec.seed).spawn(4)[3]))
-    values = _float32(shell_noise(rng, NODES, lambda k: np.where(k < k0, k / k0, (k0 / np.maximum(k, k0)) ** RAGGED)))
+    values = _float32(shell_noise(rng, NODES, lambda k: np.maximum(k / k0, 1) ** -RAGGED))
     shares = ((values, told.stool), (-values, told.bile))
-    levels = np.array([np.quantile(field, 1 - share) if share else np.inf for field, share in shares])
-    field = Lattice(random_turn(rng) * (MOTTLING_NODES / told.size_mm), values)
-    return DebrisPattern(field, levels, np.array(told.stool_colour), told.bile_absorbance * np.array(BILE))
+    levels = [np.quantile(field, 1 - share) if share else np.inf for field, share in shares]
+    turn = random_turn(rng) * (MOTTLING_NODES / told.size_mm)
+    kinds = (*told.stool_colour, *(told.bile_absorbance * BILE))
+    return DebrisPattern(Lattice(turn, values), np.array([*turn.flat, *levels, 1 / EDGE, LUMPS, LUMP_SCALE, *kinds]))
 
 
 @remembered
@@ -213,17 +190,15 @@ def _bare(spec: TissueColour) -> TissuePattern:
 
 @remembered
 def _make(patch: PatternPatch, spec: TissueColour) -> TissuePattern:
-    key = f"{patch.key} {spec.model_dump_json(exclude={'debris'})}"
-    return _unpacked(kept("tissue", key, lambda: _packed(_grown(patch, spec))))
+    return _unpacked(kept("tissue", f"{patch.key} {spec.model_dump_json()}", lambda: _packed(_grown(patch, spec))))
 
 
 def _packed(pattern: TissuePattern) -> dict[str, AnyArray]:
     """Return a pattern as arrays by name."""
     arrays: dict[str, Any] = {}
-    for name, value in vars(pattern).items():
-        if name != "debris":
-            parts = vars(value) if name in _NESTED else {}
-            arrays |= {f"{name}.{part}": each for part, each in parts.items()} or {name: value}
+    # Debris, the last, is drawn anew.
+    for name, value in list(vars(pattern).items())[:-1]:
+        arrays |= {f"{name}.{part}": each for part, each in vars(value).items()} if name in _NESTED else {name: value}
     return {name: np.asarray(value) for name, value in arrays.items()}
 
 

@@ -163,7 +163,7 @@ def _tensors(record: Record) -> Item:
             continue
         first = np.moveaxis(array, -1, 0) if array.ndim == 3 else array
         tensor = torch.from_numpy(np.ascontiguousarray(first))
-        is_picture = tensor.dtype == torch.uint8 and name not in ("instrument", "debris")
+        is_picture = tensor.dtype == torch.uint8 and name not in ("instrument", "covering")
         made[name] = tensor.float() / 255 if is_picture else tensor
     return made | {"meta": Meta(record["meta"])}
 

@@ -44,9 +44,6 @@ def lobe_over_base(variant: str) -> Any:
         def _albedo(self, si: Any, active: Any) -> Any:
             return self.base.eval(si, active) if self.albedo_at is None else self.albedo_at(si, active)
 
-        def _bared(self, lobe: Any, si: Any, active: Any) -> Any:
-            return lobe if self.bare_at is None else lobe * self.bare_at(si, active)
-
         def _enabled(self, ctx: Any) -> tuple[bool, bool]:
             """Return whether the lobe and the base are asked for."""
             return (
