@@ -137,7 +137,7 @@ class Scaling(Spec):
 
 
 class Interlacing(Spec):
-    """A comb: odd rows, at the recorded size, show a view that has moved, by whole px; the truth is of the even ones."""
+    """A comb: odd rows, at the recorded size, are of a view that has moved, by whole px; the truth is of even ones."""
 
     shift_px: tuple[Shift, Shift] = Field((0.0, 0.0), description="how far they have moved to the right and down, px")
     zoom: float = Field(1.0, ge=0.9, le=1.1, description="how they have grown about the centre: the camera advances")
