@@ -48,9 +48,9 @@ class Field:
     unit: str
     meaning: str  # what it holds, with frame and sign
     codec: Codec  # how the member holds it
-    # which samples store it: all, those with a relief, polyps or listed instruments, or those of datasets that ask for
-    # it, by a key of its name
-    stored: Literal["always", "relief", "polyps", "instruments", "asked"] = "always"
+    # which samples store it: all, those with a relief, polyps, listed instruments or what covers tissue, or those of
+    # datasets that ask for it, by a key of its name
+    stored: Literal["always", "relief", "polyps", "instruments", "covered", "asked"] = "always"
     # what it is where that says no: the field of this name, or this number everywhere
     otherwise: str | int | None = None
 
@@ -61,6 +61,7 @@ class Field:
             "relief": has_relief(meta),
             "polyps": bool(meta.get("polyps")),
             "instruments": bool(meta["scene"].get("instruments")),
+            "covered": False,
             "asked": False,
         }[self.stored]
 
@@ -241,8 +242,8 @@ CURVATURES = Codec(
     _decode_curvature,
 )
 
-INSTRUMENT, VISIBLE, POLYP = "instrument", "visible", "polyp"
-"""Fields of the pixels of instruments, of visible highlights and of polyps."""
+INSTRUMENT, VISIBLE, POLYP, COVERING = "instrument", "visible", "polyp", "covering"
+"""Fields of the pixels of instruments, of visible highlights, of polyps, and of what covers tissue."""
 
 FIELDS = (
     Field("image", "image.png", "(H, W, 3)", "uint8", "sensor counts",
@@ -289,6 +290,9 @@ FIELDS = (
           "0, or 1 + the index in the list polyps of the polyp that is seen: where it raises the wall by more than a "
           "tenth of its height; stored where the anatomy has polyps, elsewhere it is 0 everywhere",
           PICTURE, "polyps", 0),
+    Field(COVERING, "covering.png", "(H, W)", "uint8", "1",
+          "what covers the tissue: 1 stool, 2 bile, 3 text, boxes and insets, 0 nothing; stored where a scene has any",
+          PICTURE, "covered", 0),
     Field("radiance", "radiance.npy", "(H, W, 3)", "float16", "full scale",
           "linear radiance before lens and noise, share of full scale; only in datasets that keep it", HALF, "asked"),
 )  # fmt: skip

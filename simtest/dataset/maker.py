@@ -10,7 +10,7 @@ import numpy.typing as npt
 from pydantic import JsonValue
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE
-from simtest.dataset.fields import INSTRUMENT, POLYP, VISIBLE, depth_scale_mm
+from simtest.dataset.fields import COVERING, INSTRUMENT, POLYP, VISIBLE, depth_scale_mm
 from simtest.dataset.metadata import DetectionMeta, EstimateMeta, HighlightMeta, InstanceMeta, SampleMeta
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.dataset.sample_calibration import calibration_of_picture, stored_picture
@@ -187,6 +187,8 @@ class Maker:
         radiance, scale, images = seen.radiance, seen.full_scale or 1.0, self._truth(drawn, frame)
         parts = {"specular": radiance.specular, "diffuse": radiance.diffuse, "indirect": radiance.indirect}
         images |= {name: _share_of(part, scale) for name, part in parts.items()}
+        if seen.covering is not None:
+            images[COVERING] = seen.covering
         if self.plan.dataset.visible:
             images[VISIBLE] = seen.spots.regions
         if self.plan.dataset.radiance:

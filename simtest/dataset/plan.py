@@ -86,6 +86,7 @@ class Plan:
         # Samples hold the truth of the base as well, or a map of the instruments or polyps.
         self.has_relief = any(scene.surface.relief is not None for scene in scenes)
         self.has_instruments = any(scene.instruments for scene in scenes)
+        self._is_covered = any(scene.is_covered for scene in scenes)
         self._check_shared()
         self.splits, self.samples_per_anatomy = _made_small(dataset)
         self._blocks = self._lay_out()
@@ -113,7 +114,7 @@ class Plan:
     def fields(self) -> list[Field]:
         """The fields that some sample stores."""
         shown = {"relief": self.has_relief, "instruments": self.has_instruments, "polyps": self.has_polyps}
-        stored = {"always": True, **shown}
+        stored = {"always": True, "covered": self._is_covered, **shown}
         return [field for field in FIELDS if stored.get(field.stored, getattr(self.dataset, field.name, False))]
 
     def _base(self, number: int, family: Family) -> dict[str, Any]:

@@ -118,6 +118,8 @@ class BuiltScene:
         if albedo is not None:
             colour = weakref.proxy(albedo)
             bsdf.albedo_at = lambda si, active: colour.of(si, active)
+            has_debris = albedo.pattern.debris is not None
+            bsdf.bare_at = (lambda si, active: 1 - colour.covers(si, active)[0]) if has_debris else None
         if film is not None:
             relief = weakref.proxy(film)
             bsdf.wet_at = lambda si, active: relief.wet_at(si, active)

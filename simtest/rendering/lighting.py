@@ -102,10 +102,13 @@ class Material:
 
     @contextmanager
     def painted(self, hit: Hit) -> Iterator[None]:
-        """Let the BSDF have albedo and roughness of tissue at a hit, computed once for all lights; else its own."""
+        """Let the BSDF have what varies over tissue at a hit, computed once for all lights; else its own."""
         found: dict[str, Any] = {}
         if self.albedo is not None:
-            found["albedo_at"] = self.albedo.of(hit.base, hit.base.is_valid())
+            valid = hit.base.is_valid()
+            found["albedo_at"] = self.albedo.of(hit.base, valid)
+            if self.albedo.pattern.debris is not None:
+                found["bare_at"] = 1 - self.albedo.covers(hit.base, valid)[0]
         if self.film is not None:
             assert hit.jets is not None
             found["wet_at"] = self.film.wet(hit.jets.gain)

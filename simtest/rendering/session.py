@@ -310,6 +310,17 @@ class Session:
             self._cover = cover_of(self, self._instruments, self._centre_hits()[0])
         return self._cover
 
+    @_at_its_variant
+    def debris(self) -> Image | None:
+        """Return the shares that stool and bile cover at the pixels' centres, shape (2, H, W); None without debris."""
+        if self._albedo is None or self._albedo.pattern.debris is None:
+            return None
+        pixels = np.moveaxis(self.camera.pixel_centres(), 2, 0)
+        base = self._tracer().hit(*(to_kernel(mi.Float, axis.ravel(), np.float32) for axis in pixels))[2].base
+        shares = evaluate([*self._albedo.covers(base, base.is_valid())], pixels[0].size)
+        covers, cover = np.reshape(shares, pixels.shape), self.cover()
+        return covers if cover is None else np.where(cover.seen, np.float32(0), covers)
+
     # Truth -------------------------------------------------------------------------------------------------------
 
     def to_model(self, points: Array) -> Array:

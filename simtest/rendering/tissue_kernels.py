@@ -251,21 +251,23 @@ class AlbedoKernel:
         self._is_mirrored, self._is_layered = bool((table.half_mm < ENDLESS).any()), bool(pattern.fall.any())
         first = np.zeros(-(-len(table.first) // PACKET) * PACKET, dtype=np.float32)
         first.view(np.uint32)[: len(table.first)] = table.first
-        parts = [_header(pattern), *(_packets(lattice) for lattice in lattices), first, table.rows.ravel()]
+        debris = [] if (own := pattern.debris) is None else [own.numbers.astype(np.float32), _packets(own.field)]
+        parts = [_header(pattern), *(_packets(lattice) for lattice in lattices), *debris, first, table.rows.ravel()]
         # The sizes of all but the last two are the same for all patterns.
         self._lattices = [sum(map(len, parts[: 1 + i])) // PACKET for i in range(len(lattices))]
-        self._first = sum(map(len, parts[:3]))
-        parts[0].view(np.uint32)[ROWS] = sum(map(len, parts[:4])) // PACKET
+        self._debris = sum(map(len, parts[:3]))
+        self._first = sum(map(len, parts[:-2]))
+        parts[0].view(np.uint32)[ROWS] = sum(map(len, parts[:-1])) // PACKET
         self._buffer = mi.Float(np.concatenate(parts))
 
     def of(self, si: Any, active: Any) -> Any:
         """Compute the albedo, mitsuba.Spectrum, of surface points, mitsuba.SurfaceInteraction3f."""
-        return self.at(si.p if self.rest is None else self.rest.point(si, active), active)
+        return self.at(self._rest_point(si, active), active)
 
     def at(self, p: Any, active: Any) -> Any:
         """Compute the albedo, mitsuba.Spectrum, at points of the surface, mitsuba.Point3f, model frame, mm."""
         p = mi.Vector3f(p)
-        field, net = (self._lattice(i, p, active) for i in range(len(self._lattices)))
+        field, net = (self._lattice(TURN + 9 * i, first, p, active) for i, first in enumerate(self._lattices))
         artery, vein, depths = self._chords(p, active)
         colour = []
         for channel in range(CHANNELS):
@@ -277,9 +279,36 @@ class AlbedoKernel:
             below = 1 - shares[0] * (1 - dr.exp(-arterial * artery))
             below *= 1 - shares[1] * (1 - dr.exp(-venous * vein))
             colour.append(dr.clip(base * dr.exp(-field * mottled - net * netted) * below, 0, 1))
+        if self.pattern.debris is not None:
+            colour = self._soiled(colour, p, active)
         if channels() == CHANNELS:
             return mi.Spectrum(*colour)
         return mi.Spectrum(mi.luminance(mi.Color3f(*colour)))
+
+    def covers(self, si: Any, active: Any) -> tuple[Any, Any]:
+        """Compute the shares that stool and bile cover, mitsuba.Float, at surface points (`DebrisPattern`)."""
+        stool, bile, _ = self._covers(self._rest_point(si, active), active)
+        return dr.select(active, stool, 0), dr.select(active, bile, 0)
+
+    def _rest_point(self, si: Any, active: Any) -> Any:
+        return si.p if self.rest is None else self.rest.point(si, active)
+
+    def _covers(self, p: Any, active: Any) -> tuple[Any, Any, list[Any]]:
+        """Compute the shares of `covers` at points at rest; return the pattern's other numbers too."""
+        numbers = [self._number(self._debris + i) for i in range(9, 20)]
+        field = self._lattice(self._debris, self._debris // PACKET + 5, mi.Vector3f(p), active)
+        high, low, sharpness = numbers[:3]
+        stool, bile = (dr.clip(0.5 + (f - level) * sharpness, 0, 1) for f, level in ((field, high), (-field, low)))
+        return stool, bile, numbers[3:]
+
+    def _soiled(self, albedo: list[Any], p: Any, active: Any) -> list[Any]:
+        """Lay debris over an albedo, by channel."""
+        stool, bile, (lumps, scale, *colours) = self._covers(p, active)
+        matter = dr.exp(-lumps * self._lattice(self._debris, self._debris // PACKET + 5, scale * p, active))
+        return [
+            dr.clip(dr.lerp(own * dr.exp(-bile * absorbed), brown * matter, stool), 0, 1)
+            for own, brown, absorbed in zip(albedo, colours[:CHANNELS], colours[CHANNELS:], strict=True)
+        ]
 
     def _number(self, index: int) -> Any:
         """Return a number of the header."""
@@ -327,11 +356,10 @@ class AlbedoKernel:
         depths = [deep / dr.maximum(weight, LEAST_CHORD) for weight, deep in zip(sums[::2], sums[1::2], strict=True)]
         return artery, vein, depths
 
-    def _lattice(self, which: int, p: Any, active: Any) -> Any:
-        """Interpolate a periodic lattice; see `Lattice.at`."""
+    def _lattice(self, turn: int, packets: int, p: Any, active: Any) -> Any:
+        """Interpolate a periodic lattice, by the places of its turn and its packets; see `Lattice.at`."""
         nodes = self._nodes
-        turn = mi.Matrix3f(*(self._number(TURN + 9 * which + i) for i in range(9)))
-        cells = turn @ p
+        cells = mi.Matrix3f(*(self._number(turn + i) for i in range(9))) @ p
         corner = dr.floor(cells)
         share = cells - corner
         # The number of nodes is a power of two.
@@ -339,7 +367,7 @@ class AlbedoKernel:
         total = mi.Float(0)
         for up, weight in ((0, 1 - share.x), (1, share.x)):
             slab = (x + up) & (nodes - 1)
-            low = self._packet(self._lattices[which] + (slab * nodes + y) * nodes + z, active)
+            low = self._packet(packets + (slab * nodes + y) * nodes + z, active)
             first, second = dr.lerp(low[0], low[1], share.z), dr.lerp(low[2], low[3], share.z)
             total += weight * dr.lerp(first, second, share.y)
         return total

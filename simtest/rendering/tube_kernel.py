@@ -172,7 +172,9 @@ class TubeKernel:
         # Derivatives and normal in the basis (T, rho, tau)
         pu, pv = mi.Vector3d(A, r.u, 0), mi.Vector3d(0, r.v, r.f)
         puu = mi.Vector3d(
-            frame.gain - frame.twist * r.f * cosine - 2 * bend * r.u * cosine, A * bend * cosine + r.uu, -A * bend * sine
+            frame.gain - frame.twist * r.f * cosine - 2 * bend * r.u * cosine,
+            A * bend * cosine + r.uu,
+            -A * bend * sine,
         )
         puv = mi.Vector3d(bend * (r.f * sine - r.v * cosine), r.uv, r.u)
         pvv = mi.Vector3d(0, r.vv - r.f, 2 * r.v)

@@ -37,7 +37,16 @@ from simtest.simulation.highlights import (
     find_spots,
     verdicts,
 )
-from simtest.simulation.sensor import capture, centred, check_codec, collect, full_scale_of_average, noise_at, to_uint8
+from simtest.simulation.sensor import (
+    capture,
+    centred,
+    check_codec,
+    collect,
+    full_scale_of_average,
+    noise_at,
+    overlaid,
+    to_uint8,
+)
 from simtest.spec import Scene
 from simtest.surfaces.recipe import Polyp
 
@@ -50,6 +59,9 @@ DRAWS, FEW_DRAWS = 32, 4
 DEAR_SAMPLES = 16
 """With so many samples a pixel or fewer, a frame with a source of finite size costs no more than its quick look. A part
 of what a dataset's seed means: another number keeps other draws."""
+
+STOOL, BILE, DRAWN, COVERED = 1, 2, 3, "covered by stool or by what is drawn"
+"""What may cover tissue, and why a point below the first or the last is no isolated highlight."""
 
 TISSUE = np.array([0.55, 0.27, 0.22], dtype=np.float32)
 """Colour of a surface that has none of its own, linear."""
@@ -83,6 +95,8 @@ class RenderedView:
         What reconstruction is told.
     instruments : ndarray of uint8, shape (H, W), or None
         1 + the index of the instrument that is seen, 0 where none is; None in a scene without instruments.
+    covering : ndarray of uint8, shape (H, W), or None
+        What covers the tissue: 1 stool, 2 bile, 3 what is drawn, 0 nothing; None in a scene without any.
     """
 
     scene: Scene
@@ -93,6 +107,7 @@ class RenderedView:
     full_scale: float
     calibration: Calibration
     instruments: npt.NDArray[np.uint8] | None = None
+    covering: npt.NDArray[np.uint8] | None = None
 
     __repr__ = short_repr
 
@@ -129,7 +144,8 @@ class RenderedView:
     @cached_property
     def spots(self) -> VisibleSpots:
         """The pixels of the spots that can be seen in the noise-free frame, also of those on instruments."""
-        return find_spots(mean_channel(self._judged_light), mean_channel(self._specular), self.camera.seen)
+        seen = _undrawn(self.camera, self.covering)
+        return find_spots(mean_channel(self._judged_light), mean_channel(self._specular), seen)
 
     @cached_property
     def visible_highlights(self) -> list[VisibleHighlight]:
@@ -137,7 +153,7 @@ class RenderedView:
         light, spots, sensor = self._judged_light, self.spots, self.scene.sensor
         sigma = noise_at(light, self.full_scale, sensor, spots.rows, spots.columns, FEW_DRAWS)
         clip = self.full_scale if sensor.clips else math.inf
-        seen = self.camera.seen
+        seen = _undrawn(self.camera, self.covering)
         return describe(spots, light, self._specular, sigma, self.highlights, seen, self.instruments, clip)
 
     def frame(self, seed: int) -> Image:
@@ -234,7 +250,9 @@ def render_view(session: Session, scene: Scene, radiance: Radiance | None = None
     calibration = scene.calibration(brightest_mm(highlights))
     cover = session.cover()
     instruments = None if cover is None else cover.numbers
-    return RenderedView(scene, radiance, light, highlights, clouds, full_scale, calibration, instruments)
+    return RenderedView(
+        scene, radiance, light, highlights, clouds, full_scale, calibration, instruments, _covering(session, scene)
+    )
 
 
 def brightest_mm(highlights: Sequence[TrueHighlight]) -> float | None:
@@ -298,6 +316,33 @@ def _direct(radiance: Radiance, light: Image, scene: Scene, camera: Camera) -> I
     return collect(radiance.specular + radiance.diffuse, scene.sensor, camera)
 
 
+def _covering(session: Session, scene: Scene) -> npt.NDArray[np.uint8] | None:
+    """Return what covers the tissue (`RenderedView.covering`)."""
+    if not scene.is_covered:
+        return None
+    covering = np.zeros((session.camera.height, session.camera.width), dtype=np.uint8)
+    if (shares := session.debris()) is not None:
+        covering[shares[1] > 0.5] = BILE
+        covering[shares[0] > 0.5] = STOOL
+    if scene.sensor.overlay is not None:
+        covering[overlaid(scene.sensor.overlay, covering.shape)] = DRAWN
+    return covering
+
+
+def _undrawn(camera: Camera, covering: npt.NDArray[np.uint8] | None) -> Mask | None:
+    """Return the pixels of the view on which nothing is drawn; None where these are all."""
+    drawn = None if covering is None else covering != DRAWN
+    return camera.seen if drawn is None else drawn if camera.seen is None else camera.seen & drawn
+
+
+def _is_covered(point: HighlightPoint, covering: npt.NDArray[np.uint8] | None) -> bool:
+    """Return whether stool or what is drawn covers the pixel of a point."""
+    if covering is None:
+        return False
+    column, row = np.minimum(point.bp_px.astype(int), [covering.shape[1] - 1, covering.shape[0] - 1])
+    return covering[row, column] not in (0, BILE)
+
+
 def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) -> tuple[list[TrueHighlight], float]:
     """Judge a frame's highlights by its direct light behind the lens; return them and the full scale.
 
@@ -306,7 +351,11 @@ def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) ->
     camera = session.camera
     direct = _direct(radiance, light, scene, camera)
     points, rough = session.highlights(radiance), session.surface.relief is not None
-    examined = examine(points, mean_channel(direct), camera.seen, single=rough)
+    covering = _covering(session, scene)
+    seen, covered = _undrawn(camera, covering), [_is_covered(point, covering) for point in points]
+    points = [replace(p, lit=False, hidden=True) if over else p for p, over in zip(points, covered, strict=True)]
+    examined = examine(points, mean_channel(direct), seen, single=rough)
+    examined = [replace(e, why_not=COVERED) if over else e for e, over in zip(examined, covered, strict=True)]
     full_scale = _metered(scene, mean_channel(light), camera.seen)
     if full_scale is None:
         # Which highlights are isolated is judged without noise first.
@@ -325,8 +374,8 @@ def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) ->
     clip = full_scale if scene.sensor.clips else math.inf
     if direct.ndim == 3 and direct.max() > clip:
         # Tissue's red is clipped long before its green: each channel shows the height that is left to it.
-        limited = smooth(mean_channel(np.minimum(direct, np.float32(clip))), DEFAULT_SMOOTHING_PX, camera.seen)
-        examined = [each.clipped(limited, camera.seen) for each in examined]
+        limited = smooth(mean_channel(np.minimum(direct, np.float32(clip))), DEFAULT_SMOOTHING_PX, seen)
+        examined = [each.clipped(limited, seen) for each in examined]
     return verdicts(points, examined, sigmas, clip), full_scale
 
 

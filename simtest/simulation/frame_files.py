@@ -166,6 +166,7 @@ def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
         "mask": truth.mask,
         **({"instrument": truth.instrument} if frame.scene.shown_instruments else {}),
         **({} if truth.polyp is None else {"polyp": truth.polyp}),
+        **({} if frame.covering is None else {"covering": frame.covering}),
     }
 
 
@@ -182,6 +183,8 @@ def _description(frame: LabelledFrame) -> Json:
     if frame.polyps:
         fields |= POLYP_FIELDS
         described["polyps"] = [polyp.model_dump() for polyp in frame.polyps]
+    if frame.covering is not None:
+        fields["covering"] = "what covers tissue: 1 stool, 2 bile, 3 what is drawn; highlights below 1 and 3 are hidden"
     if sensor.encodes:
         fields["frame.png"] = "the sensor's own values, as encoding says; the largest is full scale"
         response = sensor.response.model_dump(mode="json")

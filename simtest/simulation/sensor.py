@@ -21,10 +21,13 @@ from simtest.geometry import Camera, smooth
 from simtest.runtime.arrays import Array, Image, IntArray, Mask, Picture
 from simtest.runtime.seeds import from_integer
 from simtest.spec.sensor import (
+    Box,
     Caption,
     Coding,
     ColourProcessing,
     H264Coding,
+    Inset,
+    Interlacing,
     JpegCoding,
     Mosaic,
     Overlay,
@@ -128,6 +131,9 @@ def capture(
     ValueError
         If noise is asked for without a generator.
     """
+    if sensor.fringe is not None and light.ndim == 3:
+        scales = (1 + sensor.fringe.red, 1.0, 1 + sensor.fringe.blue)
+        light = np.asarray(cv2.merge([_moved(light[..., i], scale) for i, scale in enumerate(scales)]))
     # The sensor's own colours, each pixel behind its filter.
     if sensor.colour is not None or sensor.mosaic is not None:
         light, full_scale = expose(light, full_scale, 0.0, None), 1.0
@@ -148,7 +154,7 @@ def capture(
 
 
 def encode(frame: Image, sensor: Sensor, seen: Mask | None = None) -> Image:
-    """Turn a linear frame into the picture: clip, apply the response, sharpen, scale and draw, quantise and code it.
+    """Turn a linear frame into the picture: clip, apply the response, sharpen, weave, scale, draw, quantise, code it.
 
     `seen`, shape (H, W), are the pixels inside the camera's view mask, default all.
     """
@@ -159,8 +165,10 @@ def encode(frame: Image, sensor: Sensor, seen: Mask | None = None) -> Image:
     if sensor.sharpening is not None:
         picture = sharpen(picture, sensor.sharpening)
         picture = np.clip(picture, 0.0, 1.0) if sensor.clips else picture
+    if sensor.scaling is None and sensor.interlacing is not None:
+        picture = weave(picture, sensor.interlacing)
     if sensor.scaling is not None:
-        picture = rescale(picture, sensor.scaling)
+        picture = rescale(picture, sensor.scaling, sensor.interlacing)
         picture = np.clip(picture, 0.0, 1.0) if sensor.clips else picture
     if sensor.overlay is not None:
         picture = draw(picture, sensor.overlay, seen)
@@ -372,30 +380,67 @@ def sharpen(picture: Image, sharpening: Sharpening) -> Image:
     return np.asarray(cv2.add(picture, change if picture.ndim == 2 else cv2.merge([change] * 3)))
 
 
-def rescale(picture: Image, scaling: Scaling) -> Image:
-    """Return a picture that was recorded at another size and scaled back to its own."""
+def weave(picture: Image, interlacing: Interlacing) -> Image:
+    """Return a recorded picture whose odd rows are those of the moved view; whole pixels keep the noise as it is."""
+    woven = picture.copy()
+    woven[1::2] = _moved(picture, interlacing.zoom, interlacing.shift_px, cv2.INTER_NEAREST)[1::2]
+    return woven
+
+
+def _moved(picture: Image, scale: float, shift: tuple[float, float] = (0, 0), method: int = cv2.INTER_LINEAR) -> Image:
+    """Return a picture scaled about its centre, then shifted; beyond its border the last pixels are repeated."""
+    size = picture.shape[1::-1]
+    centre = (np.array(size) - 1) / 2
+    # Where in the given picture each pixel lies.
+    matrix = np.column_stack([np.eye(2) / scale, centre - (centre + shift) / scale])
+    flags = method | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(picture, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
+
+
+def rescale(picture: Image, scaling: Scaling, interlacing: Interlacing | None = None) -> Image:
+    """Return a picture that was recorded at another size, with a comb or without, and scaled back to its own."""
     height, width = picture.shape[:2]
     size = (max(round(width * scaling.factor), 1), max(round(height * scaling.factor), 1))
     method = _METHODS[scaling.method]
     # Towards a smaller size areas are averaged, or else fine detail would alias.
     smaller = scaling.factor < 1
-    recorded = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if smaller else method)
+    recorded = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA if smaller else method))
+    recorded = recorded if interlacing is None else weave(recorded, interlacing)
     return np.asarray(cv2.resize(recorded, (width, height), interpolation=method if smaller else cv2.INTER_AREA))
 
 
 def draw(picture: Image, overlay: Overlay, seen: Mask | None) -> Image:
-    """Return an encoded picture with what the processor draws: black outside `seen`, then boxes, then captions."""
+    """Return an encoded picture with what the processor draws: black outside `seen`, boxes, insets, captions."""
     drawn = picture.copy() if seen is None else np.asarray(cv2.copyTo(picture, seen.astype(np.uint8)))
-    height, width = drawn.shape[:2]
+    live, size = drawn.copy() if overlay.insets else drawn, (drawn.shape[0], drawn.shape[1])
     for box in overlay.boxes:
-        left, top = round(box.x * width), round(box.y * height)
-        right, bottom = round((box.x + box.width) * width), round((box.y + box.height) * height)
-        drawn[top:bottom, left:right] = _paint(box.colour, drawn)
+        drawn[_area(box, size)] = _paint(box.colour, drawn)
+    for inset in overlay.insets:
+        part = drawn[_area(inset, size)]
+        if part.size:
+            part[:] = cv2.resize(cv2.flip(live, 1), part.shape[1::-1], interpolation=cv2.INTER_AREA)
     for caption in overlay.captions:
-        cover = _cover(caption, (height, width))
+        cover = _cover(caption, size)
         cover = cover if drawn.ndim == 2 else cover[..., None]
         drawn += cover * (_paint(caption.colour, drawn) - drawn)
     return drawn
+
+
+def overlaid(overlay: Overlay, size: tuple[int, int]) -> Mask:
+    """Return the pixels, shape (H, W), that boxes, insets and captions cover or touch."""
+    over = np.zeros(size, dtype=bool)
+    for part in (*overlay.boxes, *overlay.insets):
+        over[_area(part, size)] = True
+    for caption in overlay.captions:
+        over |= _cover(caption, size) > 0
+    return over
+
+
+def _area(part: Box | Inset, size: tuple[int, int]) -> tuple[slice, slice]:
+    """Return the rows and columns of a rectangle."""
+    starts, ends = (part.y, part.x), (part.y + part.height, part.x + part.width)
+    rows, columns = (slice(round(a * n), round(b * n)) for a, b, n in zip(starts, ends, size, strict=True))
+    return rows, columns
 
 
 def _paint(colour: tuple[float, float, float], picture: Image) -> Image:
@@ -483,7 +528,9 @@ def noise_at(light: Image, full_scale: float, sensor: Sensor, rows: IntArray, co
     if sensor.clips:
         brightest = colour[rows, columns].max(axis=1) / full_scale
         share = np.where(share * brightest < 1, share, NEARLY_CLIPPED / np.maximum(brightest, 1e-12))
-    plain, rng, at_once = sensor.model_copy(update={"overlay": None}), from_integer(0), max(1, CELLS // draws)
+    # What moves light or covers it has no noise of its own.
+    plain = sensor.model_copy(update=dict.fromkeys(("overlay", "fringe", "interlacing")))
+    rng, at_once = from_integer(0), max(1, CELLS // draws)
     if plain.scaling is not None:
         # All cells are scaled alike: where a pixel falls between those recorded is no noise.
         whole = plain.scaling.model_copy(update={"factor": round(CELL * plain.scaling.factor) / CELL})

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from simtest.spec.spec_model import Share, Spec, with_preset
+from simtest.spec.spec_model import UNSAID, Share, Spec, with_preset
 
 TissuePreset = Literal["colon_mucosa", "liver_capsule", "gallbladder", "stomach"]
 
@@ -97,6 +97,16 @@ class Capillaries(Spec):
     strength: float = Field(ge=0, le=1, description="absorbance of the net in green; 0: none")
 
 
+class Debris(Spec):
+    """What lies on the tissue, without a thickness of its own: stool, and bile. Depth and normals are the tissue's."""
+
+    stool: float = Field(0.0, ge=0, le=0.5, description="share of the surface below stool: opaque, no film reflects")
+    stool_colour: tuple[Share, Share, Share] = Field((0.55, 0.30, 0.05), description="its albedo, linear RGB")
+    bile: float = Field(0.0, ge=0, le=0.5, description="share of the surface below bile: clear, under the film")
+    bile_absorbance: float = Field(1.5, ge=0, le=5, description="of the bile in blue; yellow where it is thin")
+    size_mm: float = Field(6.0, ge=0.5, le=50, description="mean wavelength of the patches, mm")
+
+
 class TissueColour(Spec):
     """The albedo of tissue. A preset gives all numbers; each may be replaced."""
 
@@ -108,6 +118,7 @@ class TissueColour(Spec):
     mottling: Mottling = Mottling(**_COLON["mottling"])
     vessels: Vessels = Vessels(**_COLON["vessels"])
     capillaries: Capillaries = Capillaries(**_COLON["capillaries"])
+    debris: Debris | None = Field(None, description="stool and bile on the tissue; default none", **UNSAID)
     seed: int = Field(0, ge=0, lt=2**32, description="of the pattern")
 
     @model_validator(mode="before")

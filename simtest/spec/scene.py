@@ -26,7 +26,7 @@ from simtest.spec.reflectance import (
     TissueReflectance,
     Translucency,
 )
-from simtest.spec.sensor import Sensor
+from simtest.spec.sensor import Overlay, Sensor
 from simtest.spec.spec_model import Millimetres, Spec, validate
 from simtest.spec.surfaces import MOST_DEFORMATIONS, Deformation, Instrument, Surface
 from simtest.spec.toml_files import as_settings, read_toml, source_name
@@ -189,7 +189,14 @@ class Scene(Spec):
         colours = [self.reflectance.colour, *(light.colour for light in self.rig.lights)]
         for instrument in self.shown_instruments.values():
             colours += [instrument.metal, instrument.colour]
-        return self.albedo is not None or any(len(set(colour)) > 1 for colour in colours)
+        painted = self.albedo is not None or self.sensor.fringe is not None
+        return painted or any(len(set(colour)) > 1 for colour in colours)
+
+    @property
+    def is_covered(self) -> bool:
+        """Whether debris lies on the tissue, or something is drawn over it."""
+        drawn = self.sensor.overlay or Overlay()
+        return bool(drawn.captions or drawn.boxes or drawn.insets or (self.albedo and self.albedo.debris))
 
     def calibration(self, distance_mm: float | None = None) -> Calibration:
         """Return what reconstruction knows of the scene's camera, sensor, lights and surface.

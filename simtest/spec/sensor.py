@@ -10,7 +10,7 @@ from simtest.calibration import NoiseModel, Response
 from simtest.calibration.photometry import check_table
 from simtest.runtime.arrays import Array
 from simtest.spec.lights import CosineProfile, Profile
-from simtest.spec.spec_model import Share, Spec, with_preset
+from simtest.spec.spec_model import UNSAID, Share, Spec, with_preset
 
 SensorPreset = Literal["colonoscope_hd", "laparoscope_hd", "old_sd"]
 
@@ -63,6 +63,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 Gain = Annotated[float, Field(ge=0.05, le=20)]
+Shift = Annotated[float, Field(ge=-100, le=100)]
 Row = tuple[float, float, float]
 
 IDENTITY: tuple[Row, Row, Row] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -109,6 +110,13 @@ class ColourProcessing(Spec):
         return np.asarray(gains / gains.min())
 
 
+class Fringe(Spec):
+    """Lateral chromatic aberration: red and blue are scaled about the centre; the truth stays at the place of green."""
+
+    red: float = Field(0.002, ge=-0.01, le=0.01, description="by how much red is larger than green, share")
+    blue: float = Field(-0.002, ge=-0.01, le=0.01, description="the same of blue")
+
+
 class Sharpening(Spec):
     """Unsharp masking of the encoded picture's luma: value + amount (value - value smoothed by a Gaussian).
 
@@ -128,6 +136,13 @@ class Scaling(Spec):
     )
 
 
+class Interlacing(Spec):
+    """A comb: odd rows, at the recorded size, are of a view that has moved, by whole px; the truth is of even ones."""
+
+    shift_px: tuple[Shift, Shift] = Field((0.0, 0.0), description="how far they have moved to the right and down, px")
+    zoom: float = Field(1.0, ge=0.9, le=1.1, description="how they have grown about the centre: the camera advances")
+
+
 class Caption(Spec):
     """A line of text burnt into the picture."""
 
@@ -138,14 +153,21 @@ class Caption(Spec):
     colour: tuple[Share, Share, Share] = Field((1.0, 1.0, 1.0), description="encoded red, green, blue")
 
 
-class Box(Spec):
-    """A filled rectangle, as the inset of a position display."""
-
+class _Rectangle(Spec):
     x: Share = Field(description="left side, share of the width")
     y: Share = Field(description="upper side, share of the height")
     width: Share = Field(description="share of the width")
     height: Share = Field(description="share of the height")
+
+
+class Box(_Rectangle):
+    """A filled rectangle, as the ground of a position display."""
+
     colour: tuple[Share, Share, Share] = Field((0.0, 0.0, 0.0), description="encoded red, green, blue")
+
+
+class Inset(_Rectangle):
+    """The picture itself, small and mirrored, as a frozen frame beside the live one."""
 
 
 class Overlay(Spec):
@@ -153,6 +175,7 @@ class Overlay(Spec):
 
     captions: tuple[Caption, ...] = Field((), max_length=100)
     boxes: tuple[Box, ...] = Field((), max_length=100, description="drawn before the captions")
+    insets: tuple[Inset, ...] = Field((), max_length=10, description="drawn after the boxes", **UNSAID)
 
 
 class JpegCoding(Spec):
@@ -260,7 +283,9 @@ class Exposure(Spec):
     @model_validator(mode="after")
     def _weighs_a_mean(self) -> "Exposure":
         if self.centre is not None and self.average is None:
-            raise ValueError(f"centre = {self.centre:g}: weighs the mean that average asks for; must be left out without it")
+            raise ValueError(
+                f"centre = {self.centre:g}: weighs the mean that average asks for; must be left out without it"
+            )
         return self
 
 
@@ -272,8 +297,8 @@ def _optional(model: type[Spec]) -> set[str]:
 class Sensor(Spec):
     """From radiance to a frame, in this order.
 
-    Point spread, vignetting, exposure, colour filter mosaic, noise, demosaicing, white balance and colour matrix,
-    saturation, response, sharpening, scaling, captions, quantisation, coding.
+    Point spread, vignetting, colour fringe, exposure, colour filter mosaic, noise, demosaicing, white balance and
+    colour matrix, saturation, response, sharpening, interlacing and scaling, captions, quantisation, coding.
     """
 
     preset: SensorPreset | None = Field(
@@ -300,7 +325,9 @@ class Sensor(Spec):
     bits: Bits | None = Field(None, description="of the values; default not quantised")
     mosaic: Mosaic | None = Field(None, description="default: each pixel measures all colours")
     colour: ColourProcessing | None = Field(None, description="default: the sensor's colours are the picture's")
+    fringe: Fringe | None = Field(None, description="colour fringe; default none", **UNSAID)
     sharpening: Sharpening | None = Field(None, description="default none")
+    interlacing: Interlacing | None = Field(None, description="default none", **UNSAID)
     scaling: Scaling | None = Field(None, description="default: recorded at the camera's size")
     overlay: Overlay | None = Field(None, description="default: nothing is drawn")
     coding: Coding | None = Field(None, description="lossy coding of the picture; needs bits = 8; default none")
@@ -345,7 +372,8 @@ class Sensor(Spec):
     @property
     def is_processed(self) -> bool:
         """Whether the picture goes through stages behind the response, which change neighbouring pixels."""
-        return any(stage is not None for stage in (self.sharpening, self.scaling, self.overlay, self.coding))
+        stages = (self.sharpening, self.interlacing, self.scaling, self.overlay, self.coding)
+        return any(stage is not None for stage in stages)
 
     @property
     def encodes(self) -> bool:

@@ -22,6 +22,9 @@ Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9_-
 
 Share = Annotated[float, Field(ge=0, le=1)]
 
+UNSAID: dict[str, Any] = {"exclude_if": lambda value: not value}
+"""For keys that came later: a model without them is written as it was before."""
+
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 Millimetres = Annotated[float, Field(ge=1e-3, le=1e6)]

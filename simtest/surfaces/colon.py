@@ -154,7 +154,7 @@ def _mesh(tube: Tube, edge_mm: float | None) -> dict[str, AnyArray]:
     turn = np.where(turn < last - math.pi, turn + 2 * math.pi, turn)
     corners[:, :, 1] = np.where(pole, (turn.sum(axis=1, keepdims=True) - turn) / 2, turn)
     # A triangle of which no corner is near a polyp's edge shows none.
-    on_polyp = tube.polyp_at(*parameters.T, edge=POLYP_EDGE / 3)[faces].any(axis=1)
+    on_polyp = tube.polyp_at(parameters[:, 0], parameters[:, 1], POLYP_EDGE / 3)[faces].any(axis=1)
     return {"vertices": vertices, "faces": faces, "normals": normals, "corners": corners, "on_polyp": on_polyp}
 
 

@@ -6,11 +6,12 @@ for each channel c. g is the mottling, a periodic random field of space of unit 
 0 to 1; a_c and b_c follow the root of blood's absorption, as the reflectance of a scattering medium does. L is the
 chord through a vessel (Beer and Lambert), mu_c the absorption of its blood, and s_c = exp(-depth / reach_c) the share
 of the light that comes back from below the vessel's depth. Red reaches deepest: below, vessels are bluish and blurred.
+The kernel lays debris over it.
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -95,6 +96,11 @@ MESH_NODES = 8.0
 WALL = 0.1
 """Half-width of a capillary over the width of a mesh."""
 
+RAGGED, EDGE, LUMPS, LUMP_SCALE, BILE = 1.2, 0.15, 0.25, 5.0, np.array([0.12, 0.05, 1.0])
+"""Of debris, by eye: power of the wave number by which its short waves are weaker; width of its edges, deviations;
+deviation of the absorbance of stool's lumps, and how much smaller than its patches they are; bile's absorbance over
+that in blue."""
+
 
 @dataclass(frozen=True)
 class Lattice:
@@ -107,6 +113,18 @@ class Lattice:
         """Return the field at points, shape (N, 3), model frame, mm."""
         cells = points @ self.lattice_from_model.T
         return np.asarray(ndimage.map_coordinates(self.values, cells.T, order=1, mode="grid-wrap"))
+
+
+@dataclass(frozen=True)
+class DebrisPattern:
+    """What lies on one surface's tissue: stool where a field f is above a level, bile where -f is above another.
+
+    Each covers the share 1/2 + (f - level) / EDGE, from 0 to 1. Bile absorbs; stool hides, with an albedo of
+    exp(-LUMPS f(LUMP_SCALE p)) times its colour.
+    """
+
+    field: Lattice
+    numbers: Array  # (20,): turn, levels, 1 / EDGE, LUMPS, LUMP_SCALE, albedo of stool, absorbance of bile
 
 
 @dataclass(frozen=True)
@@ -124,9 +142,10 @@ class TissuePattern:
     share: Array
     fall: Array
     vessels: SegmentTable
+    debris: DebrisPattern | None = None
 
     def albedo(self, points: Array) -> Array:
-        """Return the albedo at points of the surface, model frame, mm, linear RGB; the kernel's slow reference."""
+        """Return the albedo below debris at points, model frame, mm, linear RGB; the kernel's slow reference."""
         field, net = self.mottling.at(points), self.capillaries.at(points)
         value = self.base * np.exp(-field[:, None] * self.mottled - net[:, None] * self.netted)
         chords, depths = self.vessels.seen(points)
@@ -142,10 +161,26 @@ _NESTED: dict[str, Any] = {"mottling": Lattice, "capillaries": Lattice, "vessels
 
 def make_pattern(surface: SurfaceModel, spec: TissueColour) -> TissuePattern:
     """Make the pattern of a surface; the last few are cached."""
+    if spec.debris is not None:
+        return replace(make_pattern(surface, spec.model_copy(update={"debris": None})), debris=_debris(spec))
     if not spec.vessels.strength:
         # Mottling and capillaries fill space: without visible vessels all surfaces have the same pattern.
         return _bare(spec)
     return _make(surface_patch(surface), spec)
+
+
+@remembered
+def _debris(spec: TissueColour) -> DebrisPattern:
+    """Draw what lies on tissue; of space its shares are exact."""
+    assert spec.debris is not None
+    told, k0 = spec.debris, 2 * np.pi / MOTTLING_NODES
+    rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(spec.seed).spawn(4)[3]))
+    values = _float32(shell_noise(rng, NODES, lambda k: np.maximum(k / k0, 1) ** -RAGGED))
+    shares = ((values, told.stool), (-values, told.bile))
+    levels = [np.quantile(field, 1 - share) if share else np.inf for field, share in shares]
+    turn = random_turn(rng) * (MOTTLING_NODES / told.size_mm)
+    kinds = (*told.stool_colour, *(told.bile_absorbance * BILE))
+    return DebrisPattern(Lattice(turn, values), np.array([*turn.flat, *levels, 1 / EDGE, LUMPS, LUMP_SCALE, *kinds]))
 
 
 @remembered
@@ -162,7 +197,8 @@ def _make(patch: PatternPatch, spec: TissueColour) -> TissuePattern:
 def _packed(pattern: TissuePattern) -> dict[str, AnyArray]:
     """Return a pattern as arrays by name."""
     arrays: dict[str, Any] = {}
-    for name, value in vars(pattern).items():
+    # Debris, the last, is drawn anew.
+    for name, value in list(vars(pattern).items())[:-1]:
         arrays |= {f"{name}.{part}": each for part, each in vars(value).items()} if name in _NESTED else {name: value}
     return {name: np.asarray(value) for name, value in arrays.items()}
 

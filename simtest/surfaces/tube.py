@@ -385,9 +385,10 @@ class Tube:
         """
         most, numbers = np.full(len(u), edge), np.zeros(len(u), dtype=np.uint8)
         bare = self._wall(u, v, second=False).value if self._stalks else np.empty(0)
+        at = self._placed(u)[0] if self.depth else u
         for number in range(len(self.polyps)):
             bump = self._sessile.get(number)
-            raised = self._stalks[number].raised(bare) if bump is None else bump.shape_at(u, v)
+            raised = self._stalks[number].raised(bare) if bump is None else bump.shape_at(at, v)
             numbers[raised > most] = number + 1
             most = np.maximum(most, raised)
         return numbers

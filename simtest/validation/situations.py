@@ -134,6 +134,8 @@ def _sensor(scene: Scene) -> str:
             ("sharpening", sensor.sharpening is not None),
             ("rescaled", sensor.scaling is not None),
             ("overlay", sensor.overlay is not None),
+            ("colour fringe", sensor.fringe is not None),
+            ("interlaced", sensor.interlacing is not None),
         )
         if applies
     ]
@@ -302,7 +304,7 @@ def _spot(rows: pl.DataFrame, told: Mapping[str, object]) -> str:
 
 MEASURED = Path(__file__).parent / "measured_realism.json"
 
-CHAIN = ("mosaic", "colour", "sharpening", "scaling", "overlay", "coding")
+CHAIN = ("fringe", "mosaic", "colour", "sharpening", "interlacing", "scaling", "overlay", "coding")
 """Stages of the camera chain, keys of `sensor`: with one of them, or with motion, there is a chain."""
 
 UNKNOWN = "Its distance to real frames is not known; `simtest realism` measures it."

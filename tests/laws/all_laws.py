@@ -41,7 +41,7 @@ IN_SESSION = (
     reflections.lobes, reflections.emission, labels.surfaces, labels.polyps, labels.frame_files,
     tables.counts, tables.columns, tables.thresholds, tissues.relief,
 )  # fmt: skip
-RENDERING = (randomness.noises, lenses.lens_rays, reflections.bounces, labels.dataset)
+RENDERING = (randomness.noises, lenses.lens_rays, reflections.bounces, labels.dataset, tissues.debris)
 
 
 def measures() -> dict[str, Callable[[], list[Law]]]:

@@ -9,10 +9,13 @@ from simtest.geometry import Camera
 from simtest.rendering import Session
 from simtest.rendering.subsurface import spread, transfer
 from simtest.runtime.arrays import Array, Mask
+from simtest.simulation.frame import make_frame
 from simtest.spec import scene_from_dict
 from simtest.spec.reflectance import Translucency
 from simtest.spec.surfaces import Relief
+from simtest.surfaces import make_surface
 from simtest.surfaces.relief_field import make_relief
+from simtest.surfaces.tissue_pattern import make_pattern
 from simtest.validation.laws import cloud_covariance, glint_count, relief_error
 from tests.laws import by_hand
 from tests.laws.law import Law, law
@@ -81,6 +84,52 @@ def _fine_normals(session: Session, quantity: str, film: dict[str, Any]) -> Law:
     off = by_hand.angle_deg(truth.normal[truth.mask], normal).max()
     about = "a rise of the height turns the normal away from it; differences of 2e-4 mm"
     return law("relief", quantity, "deg", float(off), 1e-3, n=len(points), about=about)
+
+
+def debris() -> list[Law]:
+    """Compare what lies on the tissue of a plane with its field at the true points, and the light off it with Beer."""
+    camera = {"width": 120, "height": 90, "fx": 90.0, "fy": 90.0}
+    albedo: dict[str, Any] = {"vessels": {"strength": 0.0}, "seed": 4}
+    lying = {"stool": 0.2, "bile": 0.3, "bile_absorbance": 1.2, "size_mm": 3.0}
+    frames = {}
+    for name, more in (("clean", {}), ("covered", {"debris": lying})):
+        reflectance = {"type": "phong", "exponent": 4.0, "specular": 0.3, "albedo": albedo | more}
+        described = {"surface": {"type": "plane", "distance_mm": 20.0}, "camera": camera, "reflectance": reflectance}
+        frames[name] = make_frame(scene_from_dict(described, "law"))
+    clean, covered = frames["clean"], frames["covered"]
+    assert covered.covering is not None
+    told = make_pattern(make_surface(covered.scene.surface), covered.scene.albedo).debris  # type: ignore[arg-type]
+    assert told is not None
+    # The field at the true points, by the lattice's own interpolation.
+    pose = covered.world_from_camera
+    points = covered.truth.position.reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
+    field, (high, low) = told.field.at(points).reshape(covered.covering.shape), told.numbers[9:11]
+    expected = np.where(field > high, 1, np.where(-field > low, 2, 0))
+    wrong = float(np.mean(covered.covering != expected))
+    # Beyond the edges: stool has no lobe, bile takes its share of the base's light, and clean tissue stays.
+    inner = [field > high + 0.2, -field > low + 0.2, (field < high - 0.2) & (-field < low - 0.2)]
+    off = [
+        np.abs(covered.radiance.specular[inner[0]]).max() / clean.radiance.specular.max(),
+        np.abs(covered.radiance.specular / clean.radiance.specular - 1)[~inner[0] & (field < high - 0.2)].max(),
+        np.abs(covered.radiance.diffuse / clean.radiance.diffuse / np.exp([-0.144, -0.06, -1.2]) - 1)[inner[1]].max(),
+        np.abs(covered.radiance.diffuse / clean.radiance.diffuse - 1)[inner[2]].max(),
+    ]
+    moved = (
+        np.abs(covered.truth.normal - clean.truth.normal).max() + np.abs(covered.truth.k_max - clean.truth.k_max).max()
+    )
+    hidden = [point.hidden and not point.lit for point in covered.highlights]
+    below = [covered.covering[int(point.bp_px[1]), int(point.bp_px[0])] == 1 for point in covered.highlights]
+    return [
+        law("debris", "covering_off", "", wrong, 2e-3, n=field.size, about="single precision decides at edges"),
+        law(
+            "debris", "stool_share", "x", float(np.mean(covered.covering == 1)) / 0.2, 1.5, 0.5, about="one realisation"
+        ),
+        law(
+            "debris", "light_off", "", float(max(off)), 1e-4, n=field.size, about="no lobe on stool; exp(-a) below bile"
+        ),
+        law("debris", "truth_moved", "", float(moved), 0.0, n=field.size, about="debris has no thickness"),
+        law("debris", "hidden_off", "", float(np.mean(np.not_equal(hidden, below))), 0.0, n=len(below)),
+    ]
 
 
 def translucency() -> list[Law]:

@@ -23,6 +23,7 @@ from simtest.spec.sensor import (
     Box,
     Caption,
     H264Coding,
+    Interlacing,
     JpegCoding,
     Mosaic,
     Overlay,
@@ -272,6 +273,62 @@ def test_scaling_equals_plain_matrices(factor):
     np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
+# What moves light -----------------------------------------------------------------------------------------------------
+
+
+def centroid(plane):
+    weight, (y, x) = plane.sum(), np.mgrid[: plane.shape[0], : plane.shape[1]] + 0.5
+    return np.array([(x * plane).sum(), (y * plane).sum()]) / weight
+
+
+@pytest.mark.parametrize("at", [(20.0, 15.0), (140.0, 90.0), (80.0, 60.0)])
+def test_a_fringe_moves_red_and_blue_by_their_shares_of_the_distance_from_the_centre(at):
+    y, x = np.mgrid[:120, :160] + 0.5
+    spot = np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2 * 3.0**2)).astype(np.float32)
+    light = np.repeat(spot[..., None], 3, axis=2)
+    found = camera_chain.capture(light, 1.0, sensor(fringe={"red": 0.01, "blue": -0.008}), None)
+    away = np.array(at) - [80.0, 60.0]
+    for channel, share in enumerate((0.01, 0.0, -0.008)):
+        np.testing.assert_allclose(centroid(found[..., channel]) - at, share * away, atol=0.03)
+    np.testing.assert_array_equal(found[..., 1], spot)
+    # Grey light has no colours, and without the stage nothing moves.
+    np.testing.assert_array_equal(camera_chain.capture(spot, 1.0, sensor(fringe={}), None), spot)
+    np.testing.assert_array_equal(camera_chain.capture(light, 1.0, sensor(), None), light)
+
+
+def test_a_comb_moves_the_odd_rows_alone_and_by_whole_pixels():
+    frame = picture((60, 80, 3), smooth=0.0)
+    told = sensor(interlacing={"shift_px": [5.3, -2.0]})
+    found = camera_chain.capture(frame, 1.0, told, None)
+    np.testing.assert_array_equal(found[::2], frame[::2])
+    np.testing.assert_array_equal(found[1:57:2, 5:], frame[3:59:2, :-5])
+    # Where it grows, a pixel comes from where it was, half a pixel off at most.
+    y, x = (axis.astype(np.float32) for axis in np.mgrid[:60, :80])
+    for values, centre, at in ((x, 39.5, x), (y, 29.5, y)):
+        grown = camera_chain.weave(values, Interlacing(zoom=1.1))[1::2]
+        assert np.abs(grown - (centre + (at[1::2] - centre) / 1.1)).max() <= 0.51
+
+
+def test_a_comb_has_the_rows_of_the_recorded_picture():
+    frame = picture((60, 80, 3))
+    told = sensor(interlacing={"shift_px": [4.0, 0.0]}, scaling={"factor": 0.5})
+    woven = camera_chain.rescale(frame, told.scaling, told.interlacing)
+    plain = camera_chain.rescale(frame, told.scaling)
+    moved = np.abs(woven - plain)[:, 16:-16].max(axis=(1, 2))
+    # A row recorded is two of the picture: those between are mixed, and the middle of each even one stays.
+    assert moved[2::4].min() > 3 * moved[[0, -1]].min()
+    np.testing.assert_allclose(camera_chain.capture(frame, 1.0, told, None), woven, atol=1e-6)
+
+
+def test_what_moves_or_covers_light_leaves_its_noise():
+    light = np.full((64, 64, 3), 0.5, np.float32)
+    keys = {"full_well": 2000, "response": {"type": "srgb"}, "sharpening": {}}
+    extra = {"fringe": {"red": 0.01}, "interlacing": {"shift_px": [9, 0]}, "overlay": OVERLAY}
+    at = (np.array([20, 41]), np.array([30, 12]), 16)
+    np.testing.assert_array_equal(noise_at(light, 1.0, sensor(**keys, **extra), *at),
+                                  noise_at(light, 1.0, sensor(**keys, overlay={}), *at))  # fmt: skip
+
+
 # Graphics -------------------------------------------------------------------------------------------------------------
 
 
@@ -302,6 +359,38 @@ def test_captions_have_the_asked_height(height):
     found = camera_chain.draw(np.zeros((100, 100), np.float32), overlay, None)
     rows = np.nonzero(found.max(axis=1) > 0.5)[0]
     assert np.ptp(rows) + 1 == pytest.approx(height, abs=1)
+
+
+OVERLAY = {
+    "boxes": [{"x": 0.5, "y": 0.1, "width": 0.25, "height": 0.2, "colour": [0.0, 0.0, 0.3]},
+              {"x": 0, "y": 0.8, "width": 0.3, "height": 0.4}],
+    "insets": [{"x": 0.7, "y": 0.6, "width": 0.25, "height": 0.25}],
+    "captions": [{"text": "15/03/2012", "x": 0.1, "y": 0.5, "height_px": 14, "colour": [1.0, 1.0, 0.2]}],
+}  # fmt: skip
+
+
+def test_the_mask_of_an_overlay_is_every_pixel_that_it_changes():
+    """Two pictures that differ everywhere: what is drawn is alike on both but for the inset, whose place is known."""
+    overlay = Overlay.model_validate(OVERLAY)
+    dark, light = np.zeros((100, 200, 3), np.float32), np.full((100, 200, 3), 0.6, np.float32)
+    changed = (camera_chain.draw(dark, overlay, None) != dark) | (camera_chain.draw(light, overlay, None) != light)
+    changed = changed.any(axis=2)
+    # A picture of one colour is its own inset.
+    changed[60:85, 140:190] = True
+    np.testing.assert_array_equal(camera_chain.overlaid(overlay, (100, 200)), changed)
+    assert 0.1 < changed.mean() < 0.4
+
+
+def test_an_inset_is_the_mirrored_picture_without_what_is_drawn():
+    frame = picture((80, 120, 3), smooth=6.0)
+    insets = {"insets": [{"x": 0.5, "y": 0.5, "width": 0.25, "height": 0.25}], "captions": []}
+    overlay = Overlay.model_validate(OVERLAY | insets)
+    found = camera_chain.draw(frame, overlay, None)[40:60, 60:90]
+    expected = frame[:, ::-1].reshape(20, 4, 30, 4, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    # One that has no pixel, or ends beyond the frame, is drawn as far as it can be.
+    for own in ({"x": 1, "y": 1, "width": 0.2, "height": 0.2}, {"x": 0.9, "y": 0.5, "width": 0.5, "height": 0.001}):
+        camera_chain.draw(frame, Overlay.model_validate({"insets": [own]}), None)
 
 
 def test_overlay_of_a_grey_picture_takes_the_lumas():
@@ -412,12 +501,13 @@ def test_stages_come_in_physical_order():
     """The whole chain equals its stages called one by one, in the order of the sensor's docstring."""
     told = sensor(mosaic={}, colour=WARM, full_well=4000, read_noise=3.0, noise_sigma=0.005, response={"type": "srgb"},
                   sharpening={}, scaling={"factor": 0.7}, overlay={"captions": [{"text": "A"}]}, bits=8,
-                  coding={"type": "jpeg", "quality": 80})  # fmt: skip
+                  coding={"type": "jpeg", "quality": 80}, fringe={}, interlacing={"shift_px": [3, 0]})  # fmt: skip
     light = (4 * picture((64, 96, 3))).astype(np.float32)
     found = camera_chain.capture(light, 2.0, told, np.random.default_rng(7))
     # One by one.
     rng = np.random.default_rng(7)
-    own = camera_chain.as_seen_by_sensor(light / np.float32(2), told.colour)
+    moved = camera_chain.capture(light, 1.0, Sensor(fringe=told.fringe), None)
+    own = camera_chain.as_seen_by_sensor(moved / np.float32(2), told.colour)
     plane = camera_chain.behind_filters(own, told.mosaic)
     share = camera_chain.poisson(plane * np.float32(4000), rng) * np.float32(1 / 4000)
     plane = share + np.float32(3.0 / 4000) * rng.standard_normal(plane.shape, dtype=np.float32)
@@ -425,7 +515,7 @@ def test_stages_come_in_physical_order():
     linear = camera_chain.develop(camera_chain.demosaic(plane, told.mosaic), told.colour, True)
     values = told.response.model().encode_picture(np.clip(linear, 0, 1))
     values = np.clip(camera_chain.sharpen(values, told.sharpening), 0, 1)
-    values = np.clip(camera_chain.rescale(values, told.scaling), 0, 1)
+    values = np.clip(camera_chain.rescale(values, told.scaling, told.interlacing), 0, 1)
     values = camera_chain.draw(values, told.overlay, None)
     expected = camera_chain.code(np.rint(values * 255).astype(np.uint8), told.coding)
     np.testing.assert_array_equal(np.rint(found * 255).astype(np.uint8), expected)

@@ -646,6 +646,8 @@ KINDS = {
         "scaling": {"sensor.scaling.factor": 0.5},
         "overlay": {"sensor.overlay.boxes": [{"x": 0, "y": 0, "width": 0.1, "height": 0.1}]},
         "coding": {"sensor.bits": 8, "sensor.coding.type": "jpeg"},
+        "fringe": {"sensor.fringe.red": 0.001},
+        "interlacing": {"sensor.interlacing.zoom": 1.01},
         "vignetting_known": {"sensor.vignetting_known": False},
     },
 }

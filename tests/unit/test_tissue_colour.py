@@ -6,9 +6,9 @@ import pytest
 from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
-from simtest.spec.reflectance import TISSUE_PRESETS, TissueColour
+from simtest.spec.reflectance import TISSUE_PRESETS, Debris, TissueColour
 from simtest.surfaces import make_surface, vessels
-from simtest.surfaces.tissue_pattern import _make, blood_absorption, make_pattern, reach
+from simtest.surfaces.tissue_pattern import EDGE, LUMP_SCALE, LUMPS, _make, blood_absorption, make_pattern, reach
 from simtest.surfaces.vessels import (
     BLUR_PER_DEPTH,
     ENDLESS,
@@ -471,3 +471,95 @@ def test_a_large_surface_gets_vessels_as_far_apart_as_its_warning_says(monkeypat
         gap = np.linalg.norm(points[:, None] - points, axis=2)
         # Of one system; both share the surface.
         assert gap[gap > 0].min() > 0.95 * 0.8 * factor * np.sqrt(2)
+
+
+# Debris ----------------------------------------------------------------------------------------------------------
+
+WAVE = {"type": "breathing", "amplitude_mm": 1.5, "period_s": 4.0, "direction": [0, 1, 1], "along": [1, 0.5, 0],
+        "wavelength_mm": 40.0}  # fmt: skip
+DEBRIS = {"stool": 0.3, "bile": 0.25, "size_mm": 3.0}
+
+
+def laid(pattern, points):
+    """The albedo with what lies on it, and both shares, by the formulas of `DebrisPattern`."""
+    field, row = pattern.debris.field, pattern.debris.numbers[9:]
+    stool, bile = (np.clip(0.5 + (sign * field.at(points) - row[i]) / EDGE, 0, 1) for i, sign in enumerate((1, -1)))
+    below = pattern.albedo(points) * np.exp(-bile[:, None] * row[8:])
+    brown = row[5:8] * np.exp(-LUMPS * field.at(LUMP_SCALE * points))[:, None]
+    return np.clip((1 - stool)[:, None] * below + stool[:, None] * brown, 0, 1), stool, bile
+
+
+def test_debris_covers_the_told_shares_and_leaves_the_tissue_below():
+    spec = TissueColour(debris=Debris(**DEBRIS))
+    pattern, points = make_pattern(surface_of("plane"), spec), on_plane(40_000, 200)
+    _, stool, bile = laid(pattern, points)
+    assert (stool > 0.5).mean() == pytest.approx(0.3, abs=0.05)
+    assert (bile > 0.5).mean() == pytest.approx(0.25, abs=0.05)
+    assert not ((stool > 0) & (bile > 0)).any()
+    np.testing.assert_array_equal(
+        pattern.albedo(points), make_pattern(surface_of("plane"), TissueColour()).albedo(points)
+    )
+    # Where a share is 0 there is none; another seed lies elsewhere.
+    bare = make_pattern(surface_of("plane"), TissueColour(debris=Debris(bile=0.2)))
+    assert not laid(bare, points)[1].any()
+    other = make_pattern(surface_of("plane"), TissueColour(debris=Debris(**DEBRIS), seed=1))
+    assert np.mean((laid(other, points)[1] > 0.5) != (stool > 0.5)) > 0.2
+
+
+@pytest.mark.render
+@pytest.mark.parametrize(("deformation", "off"), [((), 3e-3), ((WAVE,), 1.5e-2)])
+def test_a_frame_shows_what_lies_on_tissue_where_its_map_says(deformation, off):
+    """By the formulas at the true points, at rest where the surface, then a mesh, is deformed."""
+    lights = {"lights": [{}, {"offset_mm": 4.0, "power": 0.5}]}
+    data = {
+        "surface": SURFACES["sphere"],
+        "camera": SMALL,
+        "rig": lights,
+        "deformation": list(deformation),
+        "time_s": 0.6,
+    }
+    white, soiled = (
+        {"type": "phong", "exponent": 5.0, "specular": 0.3, **base}
+        for base in ({"diffuse": 1.0}, {"albedo": {"debris": DEBRIS}})
+    )
+    plain = Session(scene_from_dict({**data, "reflectance": white}), "llvm_ad_rgb")
+    session = Session(scene_from_dict({**data, "reflectance": soiled}), "llvm_ad_rgb")
+    clean, seen, truth = plain.radiance(), session.radiance(), session.truth()
+    valid = truth.mask & (clean.diffuse.min(axis=-1) > 1e-6) & (clean.specular.min(axis=-1) > 1e-6)
+    assert valid.sum() > 1000
+    points = session.to_model(truth.position[valid])
+    points = points if not deformation else session.surface.deformation.at_rest(points)
+    albedo, stool, bile = laid(make_pattern(session.surface.at_rest, TissueColour(debris=Debris(**DEBRIS))), points)
+    np.testing.assert_allclose(seen.diffuse[valid] / clean.diffuse[valid], albedo, atol=off)
+    left = seen.specular[valid] / clean.specular[valid]
+    np.testing.assert_allclose(left, np.repeat(1 - stool[:, None], 3, axis=1), atol=2 * off)
+    np.testing.assert_allclose(session.debris()[:, valid], [stool, bile], atol=2 * off)
+    assert min((stool > 0.9).mean(), (bile > 0.9).mean(), ((stool == 0) & (bile == 0)).mean()) > 0.05
+    # Without debris again, the frame is that of a session that never had any.
+    session.update(scene_from_dict({**data, "reflectance": {**soiled, "albedo": {}}}))
+    fresh = Session(scene_from_dict({**data, "reflectance": {**soiled, "albedo": {}}}), "llvm_ad_rgb").radiance()
+    np.testing.assert_array_equal(session.radiance().total, fresh.total)
+    assert session.debris() is None
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_bounces_find_stool_without_its_lobe():
+    surface = {"type": "sphere", "radius_mm": 12.0, "distance_mm": 12.0, "side": "inside"}
+
+    def bounced(**debris):
+        reflectance = {
+            "type": "phong",
+            "exponent": 5.0,
+            "specular": 0.5,
+            "albedo": tissue_of(**debris),
+        }
+        render = {"path_depth": 3, "samples_per_pixel": 8}
+        camera = {"width": 48, "height": 36, "fx": 45.0, "fy": 45.0}
+        made = {"surface": surface, "camera": camera, "render": render, "reflectance": reflectance}
+        return Session(scene_from_dict(made), "llvm_ad_rgb").radiance().indirect.mean()
+
+    black = {"base": [0.0, 0.0, 0.0]}
+    soiled = bounced(**black, debris={"stool": 0.5, "stool_colour": [0.0, 0.0, 0.0]})
+    # Nothing but the lobe reflects; both of its bounces must miss the stool.
+    assert 0.1 < soiled / bounced(**black) < 0.5

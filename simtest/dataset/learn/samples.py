@@ -10,7 +10,7 @@ import torch
 from torch.utils.data import IterableDataset, default_collate, get_worker_info
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from simtest.dataset.fields import INSTRUMENT, POLYP
+from simtest.dataset.fields import COVERING, INSTRUMENT, POLYP
 from simtest.dataset.reader import Record, SamplePosition, read, read_at, sample_positions
 from simtest.errors import InputError
 
@@ -164,7 +164,7 @@ def _tensors(record: Record) -> Item:
             continue
         first = np.moveaxis(array, -1, 0) if array.ndim == 3 else array
         tensor = torch.from_numpy(np.ascontiguousarray(first))
-        is_picture = tensor.dtype == torch.uint8 and name not in (INSTRUMENT, POLYP)
+        is_picture = tensor.dtype == torch.uint8 and name not in (INSTRUMENT, POLYP, COVERING)
         made[name] = tensor.float() / 255 if is_picture else tensor
     return made | {"meta": Meta(record["meta"])}
 

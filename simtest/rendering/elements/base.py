@@ -31,6 +31,8 @@ def lobe_over_base(variant: str) -> Any:
             self.base = props.get_texture("diffuse_reflectance", albedo)
             # Called with surface points and a mask in place of the texture, where it is set.
             self.albedo_at: Albedo | None = None
+            # The share of the lobe that is left by what lies on the surface, where it is set.
+            self.bare_at: Albedo | None = None
             glossy = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
             diffuse = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
             self.m_components = [glossy, diffuse]

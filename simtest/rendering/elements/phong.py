@@ -48,7 +48,9 @@ def make_phong(variant: str) -> Any:
                 # beta is the angle to the mirror direction.
                 log_cosine, ahead = kernel_values.log_cosine(wo, mi.reflect(si.wi))
                 scale = (self.exponent + 2) * dr.inv_two_pi * cos_o if self.normalised else mi.Float(1)
-                value += dr.select(ahead, self.specular * scale * dr.exp(self.exponent * log_cosine), 0)
+                lobe = self.specular * scale * dr.exp(self.exponent * log_cosine)
+                lobe = lobe if self.bare_at is None else lobe * self.bare_at(si, active)
+                value += dr.select(ahead, lobe, 0)
                 # Gradients must not flow through the choice of samples.
                 n = dr.detach(self.exponent)
                 density += dr.select(ahead, share * (n + 1) * dr.inv_two_pi * dr.exp(n * log_cosine), 0)

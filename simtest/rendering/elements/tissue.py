@@ -58,7 +58,7 @@ def _values(bsdf: Any, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, An
     glossy, diffuse = bsdf._enabled(ctx)
     if glossy:
         film, drawn = bsdf._film(wi, wo, bsdf._alpha(si, active))
-        value += film
+        value += film if bsdf.bare_at is None else film * bsdf.bare_at(si, active)
         density += share * drawn
     if diffuse:
         through = (1 - mi.fresnel(wi.z, bsdf.index)[0]) * (1 - mi.fresnel(wo.z, bsdf.index)[0])
