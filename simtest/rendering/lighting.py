@@ -110,8 +110,8 @@ class Material:
             if self.albedo.pattern.debris is not None:
                 found["bare_at"] = 1 - self.albedo.covers(hit.base, valid)[0]
         if self.film is not None:
-            assert hit.jets is not None
-            found["wet_at"] = self.film.wet(hit.jets.gain)
+            jets = hit.jets or self.film.jets_at(hit.base)
+            found["wet_at"] = self.film.wet(jets.gain)
         before = {name: getattr(self.bsdf, name) for name in found}
         for name, value in found.items():
             setattr(self.bsdf, name, lambda si, active, value=value: value)
