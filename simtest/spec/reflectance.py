@@ -356,15 +356,15 @@ class Patches(Spec):
     """Patches of deep and shallow film with dry ground between: the film's level is a random field over the surface."""
 
     wavelength_mm: float = Field(
-        12.0, ge=1, le=20, description="mean wavelength of the level, mm; a patch is about half as wide"
+        8.0, ge=1, le=20, description="mean wavelength of the level, mm; a patch is about half as wide"
     )
     amplitude: float = Field(
         2.0, gt=0, le=10, description="standard deviation of the level, in those of the relief's height"
     )
     dry_level: float = Field(
-        -1.5, ge=-30, le=3, description="ground is dry where the level is lower, in deviations as the level itself"
+        -2.5, ge=-30, le=3, description="ground is dry where the level is lower, in deviations as the level itself"
     )
-    dry_alpha: float = Field(0.3, ge=0.05, le=0.5, description="roughness of dry ground, in place of alpha")
+    dry_alpha: float = Field(0.45, ge=0.05, le=0.5, description="roughness of dry ground, in place of alpha")
 
 
 class Film(Spec):

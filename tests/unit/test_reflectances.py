@@ -237,6 +237,9 @@ def test_no_direction_reflects_more_than_arrives():
                 assert albedo.max() <= 1, (kind, alpha, index)
                 # Up to 60 deg; at grazing directions light that facets block is lost.
                 assert albedo[:9].min() > 0.995, (kind, alpha, index)
+        # Dry ground is rougher.
+        for alpha in (0.15, 0.2, 0.3, 0.5):
+            assert max(whole_albedo(cosine, alpha, 1.33, kind) for cosine in cosines) <= 1, (kind, alpha)
     # Why the plugin has a margin: the rough film reflects more than the smooth one at 60 deg.
     excess = film_albedo(0.5, 0.1, 1.33, "beckmann") - fresnel(0.5, 1.33)
     assert 1e-3 < excess < 0.1 / 40 * (1 - fresnel(0.5, 1.33))

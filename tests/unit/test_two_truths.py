@@ -79,6 +79,25 @@ def test_pools_of_a_film_are_labelled_smooth_and_follow_the_relief(session):
     np.testing.assert_allclose(shares, [0.5, 0.5, 0.84], atol=0.15)
 
 
+@pytest.mark.parametrize("deformed", [False, True])
+def test_patches_of_film_have_one_truth_and_labels_of_it(session, deformed):
+    """Normals, curvatures and pools of the kernel are those of the exact truth, and glints mirror the light."""
+    film = {"index": 1.34, "level": -0.3, "patches": {"wavelength_mm": 4.0}}
+    wave = {"type": "dent", "amplitude_mm": -3.0, "period_s": 2.0, "direction": [0, 0.2, 1], "radius_mm": 5.0,
+            "centre_mm": [3, 1, 2]}  # fmt: skip
+    moment = {"deformation": [wave], "time_s": 0.7} if deformed else {}
+    session.update(scene({"type": "plane"}, reflectance={"type": "tissue", "film": film}, **moment))
+    labels, truth = session.frame().labels, session.truth()
+    assert np.median(angle(labels.normal, truth.normal)[truth.mask]) < 1e-4
+    assert np.mean(labels.pool != truth.pool) < 5e-3
+    bent = np.abs(labels.k_max - truth.k_max)[truth.mask]
+    assert np.median(bent) < 1e-3 * np.median(np.abs(truth.k_max[truth.mask]))
+    found = session.highlights(session.radiance())
+    assert len(found) >= 3
+    assert max(angle(point.normal, -point.position) for point in found) < 1e-4
+    assert 0.1 < truth.pool.mean() < 0.9
+
+
 def test_a_coarse_truth_is_the_full_one_at_its_pixels(session):
     session.update(scene({"type": "sphere", "radius_mm": 6.0}))
     full, coarse = session.truth(), session.truth(stride=5)
