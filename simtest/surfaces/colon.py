@@ -147,7 +147,7 @@ def _mesh(tube: Tube, edge_mm: float | None) -> dict[str, AnyArray]:
     around = corners[:, :, 1]
     corners[:, :, 1] = np.where(around < around.max(axis=1, keepdims=True) - math.pi, around + 2 * math.pi, around)
     # A triangle of which no corner is near a polyp's edge shows none.
-    on_polyp = tube.polyp_at(*parameters.T, edge=POLYP_EDGE / 3)[faces].any(axis=1)
+    on_polyp = tube.polyp_at(parameters[:, 0], parameters[:, 1], POLYP_EDGE / 3)[faces].any(axis=1)
     return {"vertices": vertices, "faces": faces, "normals": normals, "corners": corners, "on_polyp": on_polyp}
 
 
