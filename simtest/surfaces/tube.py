@@ -349,10 +349,11 @@ class Tube:
             around, size, stalked = rng.uniform(0, 360), math.exp(rng.uniform(*sizes)), rng.uniform()
             tall, neck = rng.uniform(size=2)
             wall = self.radius(np.array([along]), np.radians([around]), second=False).value[0]
-            room = max(wall - POLYP_ROOM * recipe.radius_mm, 1.0)
+            # Within the bounds of a polyp's own keys
+            room = float(np.clip(wall - POLYP_ROOM * recipe.radius_mm, 1.0, 20.0))
             if stalked < recipe.polyp_stalked:
                 size = min(size, room)
-                height, narrow = min(size * (1 + 0.4 * tall), room), size * (0.35 + 0.25 * neck)
+                height, narrow = min(size * (1 + 0.4 * tall), room), max(size * (0.35 + 0.25 * neck), 0.5)
                 yield Polyp(along_mm=along, around_deg=around, height_mm=height, width_mm=size, neck_mm=narrow)
             else:
                 height = min(size * (0.35 + 0.35 * tall), room)
@@ -516,8 +517,9 @@ class Tube:
             exponent = -(x**2) / (2 * w2) + fold.kappa * (cosine - 1)
             # Derivatives of the exponent E; x_v = -slant cos.
             eu, ev = -x / w2, x * fold.slant * cosine / w2 - fold.kappa * sine
-            euu, euv = -1 / w2, fold.slant * cosine / w2
-            evv = -((fold.slant * cosine) ** 2 + x * fold.slant * sine) / w2 - fold.kappa * cosine if second else 0.0
+            euu: Array | float = -1 / w2
+            euv = fold.slant * cosine / w2
+            evv = -((fold.slant * cosine) ** 2 + x * fold.slant * sine) / w2 - fold.kappa * cosine
             if fold.steep:
                 turn, twice = 1 - 2 * fold.steep * exponent, 2 * fold.steep
                 euu, euv, evv = turn * euu - twice * eu**2, turn * euv - twice * eu * ev, turn * evv - twice * ev**2

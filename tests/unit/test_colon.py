@@ -338,6 +338,15 @@ def test_a_dome_has_its_height_and_width_whatever_its_steepness(steepness):
     assert not tube.polyp_at(np.array([50.0, 62]), np.radians([120, 30])).any()
 
 
+@pytest.mark.parametrize("radius", [5.0, 60.0])
+def test_polyps_are_drawn_in_the_narrowest_and_the_widest_tube(radius):
+    shape = {"length_mm": 200.0, "bend_deg": 0.0, "sway_deg": 0.0, "fold_depth_mm": radius / 5, "taenia_mm": 0.0}
+    sizes = {"polyp_count": 20, "polyp_smallest_mm": 1.0, "polyp_largest_mm": 20.0, "polyp_stalked": 0.5}
+    polyps = Tube(ColonRecipe(radius_mm=radius, **shape, **sizes)).polyps
+    assert max(polyp.height_mm for polyp in polyps) <= min(radius, 20.0)
+    assert {polyp.neck_mm is None for polyp in polyps} == {True, False}
+
+
 def test_sizes_of_drawn_polyps_are_in_order():
     with pytest.raises(ValueError, match="polyp_smallest_mm = 9"):
         ColonRecipe(polyp_smallest_mm=9.0, polyp_largest_mm=5.0)

@@ -458,7 +458,7 @@ def test_a_normal_that_leans_away_is_its_triangles_if_the_base_leans_away():
     position = np.tile([0.0, 0.0, 10.0], (1, 3, 1))
     towards, away, flat = np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.1, 1.0]), np.array([0.0, 0.6, -0.8])
     seen = SimpleNamespace(
-        position=position, depth=np.full((1, 3), 10.0), pool=np.zeros((1, 3), bool),
+        position=position, depth=np.full((1, 3), 10.0), polyp=None, pool=np.zeros((1, 3), bool),
         normal=np.array([[towards, away, away]]), normal_base=np.array([[towards, towards, away]]),
         geometric_normal=np.array([[flat, flat, flat]]),
         **{name: np.zeros((1, 3)) for name in ("k_min", "k_max", "k_min_base", "k_max_base")},
