@@ -103,6 +103,9 @@ def debris() -> list[Law]:
     field, (high, low) = told.field.at(points).reshape(covered.covering.shape), told.numbers[9:11]
     expected = np.where(field > high, 1, np.where(-field > low, 2, 0))
     wrong = float(np.mean(covered.covering != expected))
+    # A control: one tenth of a millimetre aside the map is another.
+    aside = told.field.at(points + [0.1, 0.0, 0.0]).reshape(field.shape)
+    seen_aside = np.mean((aside > high) != (field > high))
     # Beyond the edges: stool has no lobe, bile takes its share of the base's light, and clean tissue stays.
     inner = [field > high + 0.2, -field > low + 0.2, (field < high - 0.2) & (-field < low - 0.2)]
     off = [
