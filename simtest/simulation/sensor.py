@@ -429,7 +429,7 @@ def draw(picture: Image, overlay: Overlay, seen: Mask | None) -> Image:
 def overlaid(overlay: Overlay, size: tuple[int, int]) -> Mask:
     """Return the pixels, shape (H, W), that boxes, insets and captions cover or touch."""
     over = np.zeros(size, dtype=bool)
-    for part in (*overlay.boxes, *overlay.insets):
+    for part in overlay.boxes + overlay.insets:
         over[_area(part, size)] = True
     for caption in overlay.captions:
         over |= _cover(caption, size) > 0

@@ -372,8 +372,7 @@ class Sensor(Spec):
     @property
     def is_processed(self) -> bool:
         """Whether the picture goes through stages behind the response, which change neighbouring pixels."""
-        stages = (self.sharpening, self.interlacing, self.scaling, self.overlay, self.coding)
-        return any(stage is not None for stage in stages)
+        return any((self.sharpening, self.interlacing, self.scaling, self.overlay, self.coding))
 
     @property
     def encodes(self) -> bool:

@@ -1,6 +1,7 @@
 """What covers tissue, debris and what the processor draws: its map, hidden highlights, files, datasets, detection."""
 
 import json
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -16,12 +17,21 @@ from simtest.simulation.sensor import overlaid
 from simtest.spec import load_scene
 from simtest.spec.recipes import Dataset
 from simtest.spec.spec_model import validate
-from studies.detection.overlays import OverlayCounts, drawn_counts
+from studies.detection.overlays import drawn_counts
 
 pytestmark = pytest.mark.render
 
 SMALL = {"camera.width": 160, "camera.height": 120, "camera.fx": 80.0, "camera.fy": 80.0, "render.samples_per_pixel": 2,
          "reflectance.albedo.vessels.strength": 0.0}  # fmt: skip
+ROUGH = {
+    "surface": {"type": "sphere", "radius_mm": 15.0, "distance_mm": 18.0, "side": "inside",
+                "relief": {"bands": [{"slope_deg": 6.0, "wavelength_mm": 2.0}]}},
+    "reflectance": {"type": "tissue", "film": {"index": 1.35, "alpha": 0.05},
+                    "albedo": {"vessels": {"strength": 0.0}, "seed": 2}},
+    "rig.lights": [{"position_mm": [2.0, 0.0, 0.0]}],
+    "camera": {"width": 160, "height": 120, "fx": 100.0, "fy": 100.0},
+    "render.samples_per_pixel": 2,
+}  # fmt: skip
 DEBRIS = {"reflectance.albedo.debris": {"stool": 0.25, "bile": 0.25, "size_mm": 4.0}}
 BOX = {"sensor.overlay": {"boxes": [{"x": 0.5, "y": 0.0, "width": 0.5, "height": 1.0}]}}
 
@@ -29,7 +39,7 @@ BOX = {"sensor.overlay": {"boxes": [{"x": 0.5, "y": 0.0, "width": 0.5, "height":
 @pytest.fixture(scope="module")
 def frames():
     described = {"clean": {}, "debris": DEBRIS, "box": BOX, "both": DEBRIS | BOX}
-    return {name: make_frame(load_scene("tissue_colon", SMALL | keys)) for name, keys in described.items()}
+    return {name: make_frame(load_scene("sphere", deepcopy(ROUGH) | keys)) for name, keys in described.items()}
 
 
 def under(frame, points):
@@ -87,10 +97,9 @@ def test_files_hold_the_map_and_frames_without_it_are_written_as_ever(frames, tm
     np.testing.assert_array_equal(np.load(tmp_path / "both" / "truth.npz")["covering"], frames["both"].covering)
 
 
-@pytest.mark.slow
 def test_a_picture_alone_is_the_frames(frames):
     """Its exposure asks for the isolated highlights as well."""
-    scene = load_scene("tissue_colon", SMALL | DEBRIS | BOX | {"sensor.exposure": {}})
+    scene = load_scene("sphere", deepcopy(ROUGH) | DEBRIS | BOX | {"sensor.exposure": {}})
     np.testing.assert_array_equal(render_picture(Session(scene), scene), make_frame(scene).image)
 
 
@@ -113,11 +122,10 @@ def test_samples_hold_the_map_where_their_scene_is_covered(tmp_path):
 
 
 def test_detection_answers_on_nothing_that_is_drawn_and_loses_no_tissue():
-    """Text, squares, coloured and black boxes and an inset, by exact masks; the manual has more viewpoints."""
-    plain = {"reflectance.albedo.vessels.strength": 0.0}
-    made = sum((counts for _, counts in drawn_counts((3, 11), **plain)), OverlayCounts())
-    # Without the mask each frame shows the fifteen squares and characters that look like highlights, and more.
-    assert made.kept_on_overlays >= 30
+    """Text, squares, coloured and black boxes and an inset, by exact masks; the study has more viewpoints."""
+    (_, made), *_ = drawn_counts((3,), **{"reflectance.albedo.vessels.strength": 0.0})
+    # Without the mask the squares and some characters are taken for highlights.
+    assert made.kept_on_overlays >= 20
     assert made.on_overlays == 0
     assert made.tissue >= 40
-    assert made.hidden <= 0.03 * made.tissue
+    assert made.hidden <= 0.02 * made.tissue
