@@ -248,7 +248,7 @@ class Tube:
         self._folds = (*self._draw_folds(rng), *self._polyps())
         self._relief = self._draw_relief(rng)
         self.depth = recipe.radius_mm if recipe.closed else 0.0  # of each end, mm
-        # u of the ends, and of those of solutions: at the very pole there is no tangent around it
+        # u of the ends, short of the poles, where no tangent leads around, and of the last solutions
         arc, slack = (math.pi / 2 * self.depth - _POLE_MM, _POLE_MM) if recipe.closed else (0.0, _END_MM)
         self.ends = (-arc, recipe.length_mm + arc)
         self.bounds = (-arc - slack, self.ends[1] + slack)
