@@ -177,6 +177,7 @@ SURFACES = {
     "colon, polyps": {**COLON, "recipe": {"polyps": SESSILE, "relief_mm": 0.01, "relief_length_mm": 5.0}},
     "colon, tight": {**COLON, "recipe": {"length_mm": 60, "radius_mm": 6, "bend_deg": 170, "sway_deg": 20,
                                          "sway_length_mm": 60, "fold_depth_mm": 2.5, "taenia_mm": 0.3}},
+    "colon, closed": {**COLON, "viewpoint": 4, "recipe": {"length_mm": 50, "closed": True, "relief_mm": 0.01}},
     "colon, stalks": {**COLON, "recipe": {"polyps": [*STALKED, SESSILE[1]]}},
     "liver": {"type": "anatomy", "path": "liver"},
 }  # fmt: skip
@@ -229,7 +230,7 @@ def height_over(surface, X):
         return height_over(surface.rest, surface.deformation.at_rest(X))
     if hasattr(surface, "tube"):
         u, v, radial = surface.tube.slice_of(X)
-        return radial - surface.tube.radius(u, v).value
+        return radial - (surface.tube.reach(u, v) if surface.tube.depth else surface.tube.radius(u, v).value)
     return surface.body.values(X) if hasattr(surface, "body") else surface.clearance(X)
 
 
@@ -299,6 +300,7 @@ def test_points_have_the_normals_and_curvatures_of_differences(session, name, re
         ("sphere", None),
         ("colon", None),
         ("colon", "bare"),
+        ("colon, closed", None),
         pytest.param("colon, polyps", None, marks=pytest.mark.ci),
         pytest.param("colon, tight", None, marks=pytest.mark.ci),
     ],
