@@ -5,6 +5,7 @@ directions from the camera, as the light is about, and half over the surface, so
 """
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,12 +20,8 @@ from simtest.runtime.arrays import Array, Image
 PATCHES, LEVELS, BOUNCES = 512, 6, 12
 """Patches, halvings of the sphere into the directions among which they are chosen, and bounces between them."""
 
-LEAST_COSINE = 0.03
-"""Of the view of a patch, which tells its area by its direction's solid angle."""
-
 STRIDE, SAME_WALL = 4, 0.05
-"""Light that arrives is computed at every so many pixels; others take it from those that are about as far, by a share
-of the distance."""
+"""Pixels between those where the light that arrives is computed, and a share of the distance by which others differ."""
 
 
 def scattered(tracer: Tracer, hits: list[Image]) -> list[Image]:
@@ -35,12 +32,13 @@ def scattered(tracer: Tracer, hits: list[Image]) -> list[Image]:
         np.nan_to_num(part[some].reshape(-1, 3)) @ pose[:3, :3].T for part in (labels.position, labels.normal_base)
     )
     light = _arriving(_patches(tracer), places + pose[:3, 3], normals)
-    grid, (rows, columns) = mi.Float(np.hstack([depth.reshape(-1, 1), light]).ravel()), depth.shape
+    values, (rows, columns) = mi.Float(np.hstack([depth.reshape(-1, 1), light]).ravel()), depth.shape
     width = channels() + 1
 
-    def reflect(preliminary: Any, rays: Rays) -> list[Any]:
-        si = preliminary.compute_surface_interaction(rays.traced, +mi.RayFlags.All, rays.active)
-        share = _share(tracer, Hit(si, si, si))
+    def reflect(preliminary: Any, hit: Hit, rays: Rays) -> list[Any]:
+        si = hit.base
+        with tracer.material.painted(hit):
+            share = tracer.material.towards(hit, mi.Vector3f(si.sh_frame.n), si.is_valid())[1]
         # Between the four nearest of the grid
         pixel = dr.arange(mi.UInt32, dr.width(preliminary.t))
         row = pixel // tracer.sightlines.camera.width
@@ -48,19 +46,14 @@ def scattered(tracer: Tracer, hits: list[Image]) -> list[Image]:
         sums = [mi.Float(0) for _ in range(width)]
         for column, line in ((dr.floor(x) + i, dr.floor(y) + j) for i in (0, 1) for j in (0, 1)):
             index = mi.UInt32(dr.clip(line, 0, rows - 1) * columns + dr.clip(column, 0, columns - 1)) * width
-            distance, *parts = (dr.gather(mi.Float, grid, index + k) for k in range(width))
+            distance, *parts = (dr.gather(mi.Float, values, index + k) for k in range(width))
             weight = (1 - dr.abs(x - column)) * (1 - dr.abs(y - line)) + 1e-3
             weight /= 1 + dr.square((distance / si.t - 1) / SAME_WALL)
             sums = [total + weight * part for total, part in zip(sums, (1, *parts), strict=True)]
         return [dr.select(si.is_valid(), f * part / sums[0], 0) for f, part in zip(share, sums[1:], strict=True)]
 
-    return tracer.at_centres(hits, reflect)
-
-
-def _share(tracer: Tracer, hit: Hit) -> Any:
-    """Compute the base's f at hits, of light along the normal."""
-    with tracer.material.painted(hit):
-        return tracer.material.towards(hit, mi.Vector3f(hit.base.sh_frame.n), hit.base.is_valid())[1]
+    # The base alone: light from all around hardly sees the relief.
+    return replace(tracer, relief=None).at_centres(hits, reflect)
 
 
 def _patches(tracer: Tracer) -> Array:
@@ -77,20 +70,19 @@ def _patches(tracer: Tracer) -> Array:
         return tracer.scene.ray_intersect(mi.Ray3f(eye, vectors_to_kernel(mi.Vector3f, mi.Float, chosen, np.float32)))
 
     si = seen(directions)
-    cosine = dr.maximum(dr.abs(dr.dot(si.sh_frame.n, si.to_world(si.wi))), LEAST_COSINE)
+    cosine = dr.maximum(dr.abs(si.wi.z), 0.03)  # a ray along the wall says little of its area
     area = np.array(dr.select(si.is_valid(), dr.square(si.t) / cosine, 0), dtype=float) * (4 * math.pi / side**2)
-    if not area.any():
-        return np.zeros((1, 7 + channels()))
-    chance = ((area > 0) / np.count_nonzero(area) + area / area.sum()) / 2
-    chosen = np.searchsorted(np.cumsum(chance), (np.arange(PATCHES) + 0.5) / PATCHES)
+    # Of no surface at all the patches send nothing.
+    chance = ((area > 0) / max(np.count_nonzero(area), 1) + area / max(area.sum(), 1e-12)) / 2
+    chosen = np.searchsorted(np.cumsum(chance), (np.arange(PATCHES) + 0.5) / PATCHES * chance.sum())
     si = seen(directions[chosen])
-    hit, light = Hit(si, si, si), tracer.light
+    hit, light, place, normal = Hit(si, si, si), tracer.light, mi.Vector3f(si.p), mi.Vector3f(si.sh_frame.n)
     with tracer.material.painted(hit):
         first = light.radiance(tracer.blockers, tracer.material, hit, light.fixed_points())[1]
-    share, place, normal = _share(tracer, hit), mi.Vector3f(si.p), mi.Vector3f(si.sh_frame.n)
+        share = tracer.material.towards(hit, normal, si.is_valid())[1]
     dr.eval(place, normal, first, share)
     places, normals, sent, share = (vectors_from_kernel(part, float) for part in (place, normal, first, share))
-    areas, first = area[chosen, None] / (PATCHES * chance[chosen, None]), sent
+    areas, first = area[chosen, None] / (PATCHES * chance[chosen, None].clip(1e-12)), sent
     for _ in range(BOUNCES):
         sent = first + share * _arriving(np.hstack([places, normals, areas, sent]), places, normals)
     return np.hstack([places, normals, areas, sent])

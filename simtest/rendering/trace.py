@@ -174,15 +174,11 @@ class Tracer:
 
     def relabelled(self, channels: list[Image], labels: ShapeLabels) -> list[Image]:
         """Compute labels, as `centres` does, from other labels of the same hits: nothing is traced."""
-        rotation = self.sightlines.camera_from_model
+        last = self.sightlines.camera_from_model, self.relief
+        return self.at_centres(channels, lambda preliminary, hit, rays: labels.trace(preliminary, hit, rays, *last))
 
-        def label(preliminary: Any, rays: Rays) -> list[Any]:
-            return labels.trace(preliminary, self._points(rays, preliminary, True), rays, rotation, self.relief)
-
-        return self.at_centres(channels, label)
-
-    def at_centres(self, channels: list[Image], compute: Callable[[Any, Rays], list[Any]]) -> list[Image]:
-        """Compute channels, shape (H, W), by hits and rays of the pixels' centres, which labels of them tell."""
+    def at_centres(self, channels: list[Image], compute: Callable[[Any, Hit, Rays], list[Any]]) -> list[Image]:
+        """Compute other channels, shape (H, W), of the hits that the labels' tell."""
         camera = self.sightlines.camera
         depth, face, *place = (channels[CHANNELS.index(name)].ravel() for name in ("depth", "face", "second", "third"))
         rows: list[list[Image]] = []
@@ -194,7 +190,7 @@ class Tracer:
             preliminary.prim_uv = mi.Point2f(*(to_kernel(mi.Float, share[launch], np.float32) for share in place))
             preliminary.shape, preliminary.valid = mi.ShapePtr(self.scene.shapes()[0]), preliminary.t < dr.inf
             rays = self.sightlines.rays(*self.sightlines.centre(self.sightlines.lanes(first, count, False, 0)))
-            rows.append(evaluate(compute(preliminary, rays), count))
+            rows.append(evaluate(compute(preliminary, self._points(rays, preliminary, True), rays), count))
         return self._maps(rows)
 
     def _maps(self, rows: list[list[Image]]) -> list[Image]:

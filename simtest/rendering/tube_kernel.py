@@ -46,10 +46,7 @@ class _Radius:
 
 @dataclass(frozen=True)
 class _Frame:
-    """Position, mm, and basis of points: C(u), T, rho, tau, mitsuba.Vector3d; psi' and psi''; cosine and sine of v.
-
-    On a closed tube also what `Tube._placed` returns.
-    """
+    """Position, mm, and basis of points: C(u), T, rho, tau, mitsuba.Vector3d; psi' and psi''; cosine and sine of v."""
 
     centre: Any
     T: Any
@@ -59,7 +56,8 @@ class _Frame:
     twist: Any
     cosine: Any
     sine: Any
-    place: Any
+    # u, v: Along the centreline, mm, and around it. speed, gain, fade: c', c'', and h with its derivatives
+    u: Any
     v: Any
     speed: Any
     gain: Any
@@ -167,14 +165,12 @@ class TubeKernel:
         """Evaluate normals and curvatures at solutions, and turn all to the camera frame (see `pack_points`)."""
         frame = self._frame(u, v)
         r = self._radius(frame, second=True)
-        bend, cosine, sine = frame.bend, frame.cosine, frame.sine
+        bend, cosine, sine, gain = frame.bend, frame.cosine, frame.sine, frame.gain
         A = frame.speed - bend * r.f * cosine
         # Derivatives and normal in the basis (T, rho, tau)
         pu, pv = mi.Vector3d(A, r.u, 0), mi.Vector3d(0, r.v, r.f)
         puu = mi.Vector3d(
-            frame.gain - frame.twist * r.f * cosine - 2 * bend * r.u * cosine,
-            A * bend * cosine + r.uu,
-            -A * bend * sine,
+            gain - frame.twist * r.f * cosine - 2 * bend * r.u * cosine, A * bend * cosine + r.uu, -A * bend * sine
         )
         puv = mi.Vector3d(bend * (r.f * sine - r.v * cosine), r.uv, r.u)
         pvv = mi.Vector3d(0, r.vv - r.f, 2 * r.v)
@@ -242,14 +238,13 @@ class TubeKernel:
         """Compute c(u), c' and c'' of a closed tube, and h, h' and h'' (see `Tube._placed`)."""
         depth, middle = self._n["depth"], dr.clip(u, 0, self._n["length"])
         sine, cosine = dr.sincos((u - middle) / depth)
-        squared = dr.square(sine)
-        root = dr.sqrt(1 + squared)
+        squared, root = dr.square(sine), dr.sqrt(1 + dr.square(sine))
         first, second = -2 * squared * sine / root, -2 * squared * cosine * (3 + 2 * squared) / (root * (1 + squared))
         return middle + depth * sine, cosine, -sine / depth, (cosine * root, first / depth, second / dr.square(depth))
 
     def _radius(self, frame: _Frame, second: bool) -> _Radius:
         """Compute r and its derivatives (see `Tube.radius`), of a closed tube h r."""
-        n, u, v = self._n, frame.place, frame.v
+        n, u, v = self._n, frame.u, frame.v
         # taeniae
         sine, cosine = dr.sincos(3 * (v - n["taenia_phase"]))
         zero = mi.Float64(0)

@@ -37,16 +37,7 @@ from simtest.simulation.highlights import (
     find_spots,
     verdicts,
 )
-from simtest.simulation.sensor import (
-    capture,
-    centred,
-    check_codec,
-    collect,
-    full_scale_of_average,
-    noise_at,
-    overlaid,
-    to_uint8,
-)
+from simtest.simulation.sensor import capture, check_codec, collect, full_scale_of_average, noise_at, overlaid, to_uint8
 from simtest.spec import Scene
 from simtest.surfaces.recipe import Polyp
 
@@ -411,8 +402,11 @@ def _metered(scene: Scene, light: Image, seen: Mask | None) -> float | None:
     if exposure.full_scale is not None:
         radiance = exposure.full_scale
     elif exposure.average is not None:
-        inside = np.ones(light.shape, dtype=bool) if seen is None else seen
-        weights = None if exposure.centre is None else centred(inside, exposure.centre)[inside]
+        inside, weights = np.ones(light.shape, dtype=bool) if seen is None else seen, None
+        if exposure.centre is not None:
+            places = np.argwhere(inside)
+            scale = exposure.centre * math.hypot(*light.shape) / 2
+            weights = np.exp(-((places - places.mean(axis=0)) ** 2).sum(axis=1) / (2 * scale**2))
         radiance = full_scale_of_average(light[inside], exposure.average, scene.sensor, weights)
     elif exposure.percentile is not None:
         radiance = float(np.percentile(light if seen is None else light[seen], exposure.percentile))

@@ -255,9 +255,9 @@ def expose(radiance: Image, full_scale: float, noise_sigma: float, rng: np.rando
 def full_scale_of_average(light: Image, average: float, sensor: Sensor, weights: Image | None = None) -> float:
     """Return the radiance at full scale for which the mean of the clipped, encoded light is `average`.
 
-    `light` is noise-free, any shape, as are `weights`, by default alike; at least one value is positive. Values of 0 do not count: no surface is seen
+    `light` is noise-free, any shape; at least one value is positive. Values of 0 do not count: no surface is seen
     there, and a real scene has one everywhere. Where even the smallest full scale leaves the mean below `average`,
-    since most of the light falls on few pixels, it is the smallest.
+    since most of the light falls on few pixels, it is the smallest. `weights` are of the light's shape.
     """
     response, peak = sensor.response.model(), float(light.max())
     # An automatic exposure measures fields, not single pixels.
@@ -273,13 +273,6 @@ def full_scale_of_average(light: Image, average: float, sensor: Sensor, weights:
 
     # Between the brightest pixel and a tiny share of it the mean falls steadily with the full scale.
     return math.exp(_zero_of(excess, math.log(peak * 1e-6), math.log(peak * 1e3)))
-
-
-def centred(seen: Mask, deviation: float) -> Image:
-    """Return Gaussian weights about the centre of a view, of `Exposure.centre`, 0 outside the view."""
-    from_centre = np.indices(seen.shape) - np.argwhere(seen).mean(axis=0)[:, None, None]
-    scale = deviation * math.hypot(*seen.shape) / 2
-    return np.where(seen, np.exp(-(from_centre**2).sum(axis=0) / (2 * scale**2)), 0)
 
 
 def _zero_of(falling: Callable[[float], float], low: float, high: float) -> float:

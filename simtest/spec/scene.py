@@ -42,8 +42,7 @@ class Effort(Spec):
     path_depth: int = Field(2, ge=2, le=64, description="2: direct light; more adds inter-reflections")
     ambient: bool = Field(
         False,
-        description="whether walls send diffuse light back to each other: an estimate without shadows between them, "
-        "at a small part of the price of path_depth",
+        description="whether walls send diffuse light back to each other: an estimate without shadows between them",
     )
     seed: int = Field(0, ge=0, lt=2**32, description="seed of the samples")
     adaptive: bool = Field(

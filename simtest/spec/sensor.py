@@ -275,17 +275,15 @@ class Exposure(Spec):
         None,
         ge=0.05,
         le=10,
-        description="with average: standard deviation of the meter's Gaussian weights about the view's centre, share of "
-        "the frame's half diagonal; default all pixels weigh alike",
+        description="of average: standard deviation of Gaussian weights about the view's centre, share of half the "
+        "frame's diagonal; default all pixels weigh alike",
     )
     gain: float = Field(1.0, ge=1e-6, le=1e6, description="exposure over that of the rule; 2 halves full scale")
 
     @model_validator(mode="after")
     def _weighs_a_mean(self) -> "Exposure":
         if self.centre is not None and self.average is None:
-            raise ValueError(
-                f"centre = {self.centre:g}: weighs the mean that average asks for; must be left out without it"
-            )
+            raise ValueError(f"centre = {self.centre:g}: weighs the mean of average; must be left out without it")
         return self
 
 

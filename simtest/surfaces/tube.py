@@ -13,10 +13,11 @@ P_u x P_v points into the lumen while 1 - psi' r cos v > 0.
 
 A closed tube goes on beyond its ends by rounded ones of depth a = radius_mm, where C and r are those at
 c(u) = length + a sin(phi), phi = (u - length)/a, and the radius is h r, h = (1 - sin^4 phi)^(1/2); at the other end
-likewise. Normals and curvatures are continuous. c' takes the place of 1 in P_u, and c'' T is added to P_uu.
+likewise. Normals and curvatures are continuous, but for the curvatures at the pole, and c' takes the place of 1 in P_u,
+c'' T is added to P_uu.
 
-Pedunculated polyps are maps of space applied to P, which
-preserve the sense of P_u x P_v: each raises a mushroom from the wall. With z the height over the polyp's foot along its
+Pedunculated polyps are maps of space applied to P, which preserve the sense of P_u x P_v: each raises a mushroom from
+the wall. With z the height over the polyp's foot along its
 axis a, x the vector across it, q = |x|^2 and h the polyp's height,
 
     lift:     z' = z + h E(q) psi(z),   E = exp(-(tau + tau^2)/2), tau = q / (2 s^2),   psi = exp(-(z / 2h)^4)
@@ -194,11 +195,8 @@ NEWTON_TOLERANCE_MM = 1e-10
 MAX_SHIFT_MM = 3.0
 """A solution farther from the mesh's hit than this is another part of the surface: no solution."""
 
-_END_MM = 1.0
-"""How far beyond an open tube's ends a solution may lie."""
-
-_POLE_MM = 1e-6
-"""Distance of a closed tube's last points from its poles."""
+_END_MM, _POLE_MM = 1.0, 1e-6
+"""How far beyond an open tube's ends a solution may lie, and a closed one's last points from its poles."""
 
 _PANEL_MM = 4.0
 _RELIEF_WAVES = 6
@@ -285,7 +283,7 @@ class Tube:
         self._sessile = dict(self._bumps())
         self._folds += tuple(self._sessile.values())
         self.depth = recipe.radius_mm if recipe.closed else 0.0  # of each end, mm
-        # u of the ends, and of those of solutions: at the very pole there is no tangent around it
+        # u of the ends, short of the poles, where no tangent leads around, and of the last solutions
         arc, slack = (math.pi / 2 * self.depth - _POLE_MM, _POLE_MM) if recipe.closed else (0.0, _END_MM)
         self.ends = (-arc, recipe.length_mm + arc)
         self.bounds = (-arc - slack, self.ends[1] + slack)

@@ -13,7 +13,7 @@ from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.rendering import Session
 from simtest.simulation import sensor as camera_chain
-from simtest.simulation.frame import make_frame, render_view
+from simtest.simulation.frame import _metered, make_frame, render_view
 from simtest.simulation.highlights import examine
 from simtest.simulation.sensor import capture, noise_at
 from simtest.spec import load_scene
@@ -469,6 +469,33 @@ def test_automatic_exposure_reaches_its_mean(average, response, unit):
     frame = camera_chain.capture(light, scale, told, None)
     assert frame.mean() == pytest.approx(average, abs=1e-3)
     assert (frame[10:14, 10:14] == 1).all()
+
+
+def test_a_centre_weighted_meter_burns_out_the_walls_around_a_dark_lumen():
+    """About the centre of the view, which the mask moves; with wide weights it is the mean."""
+    light = np.full((120, 160), 1.0, dtype=np.float32)
+    light[40:100, 40:100] = 0.05
+    seen = np.zeros(light.shape, dtype=bool)
+    seen[10:, :140] = True  # its centre is that of the dark square
+
+    def burnt(**exposure):
+        told = sensor(saturation=True, response={"type": "srgb"}, exposure={"average": 0.4, **exposure})
+        scene = load_scene("plane").model_copy(update={"sensor": told})
+        frame = camera_chain.capture(light, _metered(scene, light, seen), told, None)
+        return frame[:40].mean(), frame[40:100, 40:100].mean(), frame[seen].mean()
+
+    near, _, mean = burnt()
+    assert near < 0.6
+    assert mean == pytest.approx(0.4, abs=1e-3)
+    np.testing.assert_allclose(burnt(centre=10), burnt(), rtol=2e-3)
+    near, lumen, _ = burnt(centre=0.1)
+    assert near == 1
+    assert lumen == pytest.approx(0.4, abs=0.01)
+
+
+def test_weights_of_no_mean_are_refused():
+    with pytest.raises(ValueError, match=r"centre = 0\.3: weighs"):
+        sensor(exposure={"percentile": 99, "centre": 0.3})
 
 
 @given(st.floats(-9, 9), st.floats(0.2, 5.0))

@@ -10,6 +10,7 @@ import pytest
 from surface_helpers import SECOND_STENCIL, derivative, hits_on, interpolated_normals
 
 from simtest.errors import InputError
+from simtest.geometry.vectors import unit
 from simtest.surfaces.colon import build
 from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import RayHits
@@ -73,6 +74,49 @@ def test_partial_derivatives_match_finite_differences(recipe):
     assert len(first.parts) == 2
     np.testing.assert_array_equal(whole.value, first.value)
     np.testing.assert_array_equal(whole.gradient, first.gradient)
+
+
+def test_a_closed_tube_goes_on_beyond_its_ends_and_has_no_way_out():
+    """Also beside a pedunculated polyp and a sessile one that reaches into the end."""
+    polyps = (STALKED[0], Polyp(along_mm=113, around_deg=10, height_mm=4, width_mm=6))
+    recipe = SHIPPED.model_copy(update={"closed": True, "polyps": polyps, "relief_mm": 0.01})
+    built, opened = build(recipe), build(recipe.model_copy(update={"closed": False}))
+    tube, mesh, rng = built.tube, built.mesh, np.random.default_rng(3)
+    (low, high), v = tube.ends, rng.uniform(-4, 8, 3000)
+    assert low < -30
+    assert high - recipe.length_mm == pytest.approx(-low)
+    # derivatives, in the ends alone
+    u = np.where(v > 2, rng.uniform(low + 0.1, 0, 3000), rng.uniform(recipe.length_mm, high - 0.1, 3000))
+    jet, around = tube.jet(u, v), STEP / 20
+    for exact, differences, atol in (
+        (jet.gradient[..., 0], derivative(lambda h: tube.jet(u + h, v).value, STEP), 1e-8),
+        (jet.hessian[..., 0, 0], derivative(lambda h: tube.jet(u + h, v).gradient[..., 0], STEP), 1e-6),
+        (jet.hessian[..., 0, 1], derivative(lambda h: tube.jet(u, v + h).gradient[..., 0], around), 1e-6),
+        (jet.hessian[..., 1, 1], derivative(lambda h: tube.jet(u, v + h).gradient[..., 1], around), 1e-5),
+    ):
+        np.testing.assert_allclose(exact, differences, atol=atol)
+    # The same wall between the ends, and one curved alike on both sides of them; the pole has one normal.
+    inner = rng.uniform(0, recipe.length_mm, 3000)
+    np.testing.assert_allclose(tube.jet(inner, v).value, opened.tube.jet(inner, v).value, atol=1e-11)
+    for end in (0.0, recipe.length_mm):
+        before, behind = (tube.normal_and_shape_operator(np.full(3000, end + side), v) for side in (-1e-7, 1e-7))
+        for one, other in zip(before, behind, strict=True):
+            np.testing.assert_allclose(one, other, atol=2e-7)
+    pole = tube.normal_and_shape_operator(np.full(3000, high), v)[0]
+    assert (np.ptp(pole, axis=0) < 1e-6).all()
+    # a mesh without an edge, whose normals are those of the surface
+    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    assert set(np.unique(edges, axis=0, return_counts=True)[1]) == {2}
+    face, weights, shown = interpolated_normals(mesh)
+    exact = tube.normal_and_shape_operator(*np.einsum("nc,nck->kn", weights, built.corners[face]))[0]
+    assert np.quantile(np.degrees(np.arccos(np.einsum("ni,ni->n", shown, exact).clip(max=1))), 0.999) < 0.3
+    # no way out, but of the open tube
+    directions = unit(rng.normal(size=(20_000, 3)))
+    eye = np.broadcast_to(tube.centreline(np.array([40.0])), directions.shape)
+    assert np.isfinite(built.probe.cast(eye, directions)).all()
+    assert not np.isfinite(opened.probe.cast(eye, directions)).all()
+    axis = tube.centreline(np.array([-23.0, -21.0, 5.0, recipe.length_mm + 21, recipe.length_mm + 23]))
+    assert np.sign(built.clearance(axis)).tolist() == [-1, 1, 1, 1, -1]
 
 
 def test_points_at_the_seam_and_misses(recipe):

@@ -177,6 +177,7 @@ SURFACES = {
     "colon, polyps": {**COLON, "recipe": {"polyps": SESSILE, "relief_mm": 0.01, "relief_length_mm": 5.0}},
     "colon, tight": {**COLON, "recipe": {"length_mm": 60, "radius_mm": 6, "bend_deg": 170, "sway_deg": 20,
                                          "sway_length_mm": 60, "fold_depth_mm": 2.5, "taenia_mm": 0.3}},
+    "colon, closed": {**COLON, "viewpoint": 4, "recipe": {"length_mm": 50, "closed": True, "relief_mm": 0.01}},
     "colon, stalks": {**COLON, "recipe": {"polyps": [*STALKED, SESSILE[1]]}},
     "colon, haustra": {**COLON, "recipe": {"fold_stagger": 0.33, "taenia_ridge_mm": 1.5, "crease_mm": 0.5,
                                            "polyp_count": 8, "polyp_stalked": 0.0}},
@@ -239,7 +240,7 @@ def height_over(surface, X):
         return height_over(surface.rest, surface.deformation.at_rest(X))
     if hasattr(surface, "tube"):
         u, v, radial = surface.tube.slice_of(X)
-        return radial - surface.tube.radius(u, v).value
+        return radial - (surface.tube.reach(u, v) if surface.tube.depth else surface.tube.radius(u, v).value)
     return surface.body.values(X) if hasattr(surface, "body") else surface.clearance(X)
 
 
@@ -310,6 +311,7 @@ def test_points_have_the_normals_and_curvatures_of_differences(session, name, re
         ("colon", None),
         ("colon", "bare"),
         ("colon, haustra", None),
+        ("colon, closed", None),
         pytest.param("colon, polyps", None, marks=pytest.mark.ci),
         pytest.param("colon, tight", None, marks=pytest.mark.ci),
     ],
