@@ -17,8 +17,8 @@ likewise. Normals and curvatures are continuous, but for the curvatures at the p
 c'' T is added to P_uu.
 
 Pedunculated polyps are maps of space applied to P, which preserve the sense of P_u x P_v: each raises a mushroom from
-the wall. With z the height over the polyp's foot along its
-axis a, x the vector across it, q = |x|^2 and h the polyp's height,
+the wall. With z the height over the polyp's foot along its axis a, x the vector across it, q = |x|^2 and h the polyp's
+height,
 
     lift:     z' = z + h E(q) psi(z),   E = exp(-(tau + tau^2)/2), tau = q / (2 s^2),   psi = exp(-(z / 2h)^4)
     stricture: x' = (1 - A g(z') w(q)) x,   g = exp(-((z' - 0.3 h) / 0.3 h)^4),   w = exp(-q^2 / l^4), l = 2.4 s
