@@ -15,7 +15,7 @@ from simtest.geometry.vectors import rotation
 from simtest.runtime.arrays import Array
 from simtest.runtime.boundary import plain_errors
 from simtest.runtime.files import as_path
-from simtest.spec.spec_model import Spec, validate
+from simtest.spec.spec_model import UNSAID, Spec, validate
 from simtest.spec.toml_files import read_toml
 
 Speed = Annotated[float, Field(ge=-1e4, le=1e4)]
@@ -307,7 +307,7 @@ class SceneCamera(CameraSpec):
     """The camera of a scene: that of a camera file, and how it moves."""
 
     motion: Motion | None = Field(None, description="during the exposure; default none")
-    moved: Moved | None = Field(None, description="from where the surface's keys put it; default not")
+    moved: Moved | None = Field(None, description="from where the surface's keys put it; default not", **UNSAID)
 
     @property
     def moving(self) -> Motion | None:

@@ -66,7 +66,11 @@ class Vessels(Spec):
     spacing_mm: float = Field(ge=0.2, le=50, description="mean distance between the ends of neighbouring twigs, mm")
     depth_mm: float = Field(ge=0, le=3, description="depth of the vessels below the surface, mm")
     deepest_mm: float | None = Field(
-        None, ge=0, le=3, description="depth of the largest, mm, the twigs' being depth_mm; default: all at depth_mm"
+        None,
+        ge=0,
+        le=3,
+        description="depth of the largest, mm, the twigs' being depth_mm; default: all at depth_mm",
+        **UNSAID,
     )
     arterial_saturation: Share = Field(0.97, description="share of oxygenated haemoglobin in arteries")
     venous_saturation: Share = Field(0.75, description="the same in veins")
@@ -381,7 +385,7 @@ class Film(Spec):
         "relief's height about its mean; default: the film follows the relief",
     )
     patches: Patches | None = Field(
-        None, description="how the level varies over the surface about `level`; default: it does not"
+        None, description="how the level varies over the surface about `level`; default: it does not", **UNSAID
     )
 
     @model_validator(mode="after")

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, model_validator
 
 from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
 from simtest.calibration.photometry import AngularProfile
@@ -27,7 +27,7 @@ from simtest.spec.reflectance import (
     Translucency,
 )
 from simtest.spec.sensor import Overlay, Sensor
-from simtest.spec.spec_model import Millimetres, Spec, validate
+from simtest.spec.spec_model import UNSAID, Millimetres, Spec, validate
 from simtest.spec.surfaces import MOST_DEFORMATIONS, Deformation, Instrument, Surface
 from simtest.spec.toml_files import as_settings, read_toml, source_name
 
@@ -43,6 +43,7 @@ class Effort(Spec):
     ambient: bool = Field(
         False,
         description="whether walls send diffuse light back to each other: an estimate without shadows between them",
+        **UNSAID,
     )
     seed: int = Field(0, ge=0, lt=2**32, description="seed of the samples")
     adaptive: bool = Field(
@@ -101,13 +102,13 @@ class Scene(Spec):
     render: Effort = Effort()
     known: KnownSpec = KnownSpec()
     instruments: tuple[Instrument, ...] = Field(
-        (), max_length=MOST_INSTRUMENTS, description="metal instruments in the picture, in the camera frame"
+        (), max_length=MOST_INSTRUMENTS, description="metal instruments in the picture, in the camera frame", **UNSAID
     )
     deformation: tuple[Deformation, ...] = Field(
-        (), max_length=MOST_DEFORMATIONS, description="how the surface deforms in time, applied in this order"
+        (), max_length=MOST_DEFORMATIONS, description="how the surface deforms in time, applied in this order", **UNSAID
     )
-    time_s: float = Field(0.0, ge=-1e6, le=1e6, description="moment of the deformation, s")
-    views: Views | None = Field(None, description="further views, for an experiment on motion; default none")
+    time_s: float = Field(0.0, ge=-1e6, le=1e6, description="moment of the deformation, s", **UNSAID)
+    views: Views | None = Field(None, description="further views, for an experiment on motion; default none", **UNSAID)
 
     __repr__ = short_repr
     __str__ = short_repr
@@ -163,19 +164,6 @@ class Scene(Spec):
                 "and tissue; must be 2 where instruments are present"
             )
         return self
-
-    @model_serializer(mode="wrap")
-    def _as_ever(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what says nothing: a scene without instruments is written as it was before there were any."""
-        dumped: dict[str, Any] = dump(self)
-        for name in ("instruments", "deformation", "time_s", "views"):
-            if not getattr(self, name):
-                dumped.pop(name, None)
-        if self.camera.moved is None:
-            dumped.get("camera", {}).pop("moved", None)
-        if self.film_patches is None:
-            dumped.get("reflectance", {}).get("film", {}).pop("patches", None)
-        return dumped
 
     @property
     def albedo(self) -> TissueColour | None:

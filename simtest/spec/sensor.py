@@ -277,6 +277,7 @@ class Exposure(Spec):
         le=10,
         description="of average: standard deviation of Gaussian weights about the view's centre, share of half the "
         "frame's diagonal; default all pixels weigh alike",
+        **UNSAID,
     )
     gain: float = Field(1.0, ge=1e-6, le=1e6, description="exposure over that of the rule; 2 halves full scale")
 
