@@ -12,7 +12,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from simtest.dataset.metadata import SampleMeta, has_relief
+from simtest.dataset.metadata import SampleMeta, has_debris, has_relief
 from simtest.dataset.png import decode, encode
 from simtest.runtime.arrays import AnyArray
 
@@ -61,7 +61,7 @@ class Field:
             "relief": has_relief(meta),
             "polyps": bool(meta.get("polyps")),
             "instruments": bool(meta["scene"].get("instruments")),
-            "covered": False,
+            "covered": has_debris(meta),
             "asked": False,
         }[self.stored]
 

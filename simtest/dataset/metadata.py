@@ -100,3 +100,10 @@ def has_relief(meta: SampleMeta) -> bool:
     """Return whether a sample's surface has a relief, so that the truth of its base is stored beside the fine one."""
     surface = meta["scene"].get("surface")
     return isinstance(surface, dict) and surface.get("relief") is not None
+
+
+def has_debris(meta: SampleMeta) -> bool:
+    """Return whether stool or bile lies on a sample's tissue."""
+    reflectance = meta["scene"].get("reflectance")
+    albedo = reflectance.get("albedo") if isinstance(reflectance, dict) else None
+    return isinstance(albedo, dict) and albedo.get("debris") is not None

@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from simtest.dataset.card import CARD, make_card
-from simtest.dataset.fields import BY_SUFFIX, FIELDS, INSTRUMENT, POLYP, VISIBLE
+from simtest.dataset.fields import BY_SUFFIX, COVERING, FIELDS, INSTRUMENT, POLYP, VISIBLE
 from simtest.dataset.index import TABLES, make_tables, shortfall
 from simtest.dataset.maker import Maker
 from simtest.dataset.manifest import (
@@ -196,10 +196,9 @@ def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
             return
     # depth, normals and curvatures
     yield from _surface(sample, camera, relief)
-    if listed and sample.images[INSTRUMENT].max() > listed:
-        yield f"{INSTRUMENT} names instrument {int(sample.images[INSTRUMENT].max())} of {listed}"
-    if (polyps := len(meta.get("polyps", ()))) and sample.images[POLYP].max() > polyps:
-        yield f"{POLYP} names polyp {int(sample.images[POLYP].max())} of {polyps}"
+    for name, most in ((INSTRUMENT, listed), (POLYP, len(meta.get("polyps", ()))), (COVERING, 3)):
+        if name in sample.images and (highest := int(sample.images[name].max())) > most:
+            yield f"{name} has the value {highest}; must be at most {most}"
     yield from _visible(sample)
     # highlights
     depth, instance = sample.images["depth"], sample.images["instance"]

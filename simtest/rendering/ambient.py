@@ -26,7 +26,8 @@ STRIDE, SAME_WALL = 4, 0.05
 
 def scattered(tracer: Tracer, hits: list[Image]) -> list[Image]:
     """Return the channels, shape (H, W), of the base's light of more bounces, from the labels' channels `hits`."""
-    some, labels, pose = np.s_[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE], as_labels(hits), tracer.sightlines.pose
+    labels, pose = as_labels(hits), tracer.sightlines.pose
+    some = tuple(slice(min(STRIDE // 2, size - 1), None, STRIDE) for size in labels.depth.shape)
     depth = np.nan_to_num(labels.depth[some])
     places, normals = (
         np.nan_to_num(part[some].reshape(-1, 3)) @ pose[:3, :3].T for part in (labels.position, labels.normal_base)
@@ -35,12 +36,13 @@ def scattered(tracer: Tracer, hits: list[Image]) -> list[Image]:
     values, (rows, columns) = mi.Float(np.hstack([depth.reshape(-1, 1), light]).ravel()), depth.shape
     width = channels() + 1
 
-    def reflect(preliminary: Any, hit: Hit, rays: Rays) -> list[Any]:
-        si = hit.base
+    def reflect(preliminary: Any, hit: Hit, rays: Rays, first: int) -> list[Any]:
+        si, start = hit.base, mi.UInt32(first)
+        dr.make_opaque(start)
         with tracer.material.painted(hit):
             share = tracer.material.towards(hit, mi.Vector3f(si.sh_frame.n), si.is_valid())[1]
         # Between the four nearest of the grid
-        pixel = dr.arange(mi.UInt32, dr.width(preliminary.t))
+        pixel = start + dr.arange(mi.UInt32, dr.width(preliminary.t))
         row = pixel // tracer.sightlines.camera.width
         x, y = ((mi.Float(at) + 0.5) / STRIDE - 0.5 for at in (pixel - row * tracer.sightlines.camera.width, row))
         sums = [mi.Float(0) for _ in range(width)]

@@ -186,7 +186,7 @@ class HighlightPoint:
     pool : bool
         Whether the point lies in a pool of the liquid film.
     hidden : bool
-        Whether an instrument hides it from the camera; it is not lit then.
+        Whether an instrument, stool or what is drawn hides it from the camera; it is not lit then.
     """
 
     light: int

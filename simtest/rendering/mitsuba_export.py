@@ -88,6 +88,7 @@ def _inexpressible(scene: Scene) -> Iterator[tuple[str, Any, str]]:
           for index in scene.shown_instruments),
         (relief is not None, "surface.relief", relief and relief.model_dump(exclude_defaults=True),
          f"{unknown} relief: must be left out"),
+        (scene.render.ambient, "render.ambient", True, f"{unknown} estimate: must be false; path_depth traces it"),
         (scene.translucency is not None, "reflectance.translucency", "a table",
          "it acts on simtest's picture: must be left out"),
         (albedo is not None, "reflectance.albedo", albedo and albedo.preset,

@@ -175,10 +175,10 @@ class Tracer:
     def relabelled(self, channels: list[Image], labels: ShapeLabels) -> list[Image]:
         """Compute labels, as `centres` does, from other labels of the same hits: nothing is traced."""
         last = self.sightlines.camera_from_model, self.relief
-        return self.at_centres(channels, lambda preliminary, hit, rays: labels.trace(preliminary, hit, rays, *last))
+        return self.at_centres(channels, lambda preliminary, hit, rays, _: labels.trace(preliminary, hit, rays, *last))
 
-    def at_centres(self, channels: list[Image], compute: Callable[[Any, Hit, Rays], list[Any]]) -> list[Image]:
-        """Compute other channels, shape (H, W), of the hits that the labels' tell."""
+    def at_centres(self, channels: list[Image], compute: Callable[[Any, Hit, Rays, int], list[Any]]) -> list[Image]:
+        """Compute other channels, shape (H, W), of the hits that the labels' tell; the last argument counts pixels."""
         camera = self.sightlines.camera
         depth, face, *place = (channels[CHANNELS.index(name)].ravel() for name in ("depth", "face", "second", "third"))
         rows: list[list[Image]] = []
@@ -190,7 +190,7 @@ class Tracer:
             preliminary.prim_uv = mi.Point2f(*(to_kernel(mi.Float, share[launch], np.float32) for share in place))
             preliminary.shape, preliminary.valid = mi.ShapePtr(self.scene.shapes()[0]), preliminary.t < dr.inf
             rays = self.sightlines.rays(*self.sightlines.centre(self.sightlines.lanes(first, count, False, 0)))
-            rows.append(evaluate(compute(preliminary, self._points(rays, preliminary, True), rays), count))
+            rows.append(evaluate(compute(preliminary, self._points(rays, preliminary, True), rays, first), count))
         return self._maps(rows)
 
     def _maps(self, rows: list[list[Image]]) -> list[Image]:

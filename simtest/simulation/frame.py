@@ -51,6 +51,8 @@ DEAR_SAMPLES = 16
 """With so many samples a pixel or fewer, a frame with a source of finite size costs no more than its quick look. A part
 of what a dataset's seed means: another number keeps other draws."""
 
+Covering = npt.NDArray[np.uint8] | None
+
 STOOL, BILE, DRAWN, COVERED = 1, 2, 3, "covered by stool or by what is drawn"
 """What may cover tissue, and why a point below the first or the last is no isolated highlight."""
 
@@ -98,7 +100,7 @@ class RenderedView:
     full_scale: float
     calibration: Calibration
     instruments: npt.NDArray[np.uint8] | None = None
-    covering: npt.NDArray[np.uint8] | None = None
+    covering: Covering = None
 
     __repr__ = short_repr
 
@@ -235,15 +237,14 @@ def render_view(session: Session, scene: Scene, radiance: Radiance | None = None
     if radiance is None:
         radiance = session.radiance()
     light = collect(radiance.total, scene.sensor, session.camera)
-    highlights, full_scale = _judged(session, scene, radiance, light)
-    highlights, clouds = _placed(session, radiance, highlights)
+    covering = _covering(session, scene)
+    highlights, full_scale = _judged(session, scene, radiance, light, covering)
+    highlights, clouds = _placed(session, radiance, highlights, covering)
     # What reconstruction is told may include the distance of the brightest highlight.
     calibration = scene.calibration(brightest_mm(highlights))
     cover = session.cover()
     instruments = None if cover is None else cover.numbers
-    return RenderedView(
-        scene, radiance, light, highlights, clouds, full_scale, calibration, instruments, _covering(session, scene)
-    )
+    return RenderedView(scene, radiance, light, highlights, clouds, full_scale, calibration, instruments, covering)
 
 
 def brightest_mm(highlights: Sequence[TrueHighlight]) -> float | None:
@@ -264,7 +265,7 @@ def render_picture(session: Session, scene: Scene, radiance: Radiance | None = N
     light, seen = collect(radiance.total, scene.sensor, session.camera), session.camera.seen
     full_scale = _metered(scene, mean_channel(light), seen)
     if full_scale is None:
-        full_scale = _judged(session, scene, radiance, light)[1]
+        full_scale = _judged(session, scene, radiance, light, _covering(session, scene))[1]
     return capture(light, full_scale, scene.sensor, from_integer(scene.sensor.seed), seen)
 
 
@@ -293,7 +294,8 @@ def shows_isolated(session: Session, scene: Scene, least: int, rendered: bool = 
     if not rendered:
         return True
     radiance = session.labelled_radiance()
-    highlights, _ = _judged(session, scene, radiance, collect(radiance.total, scene.sensor, session.camera))
+    light = collect(radiance.total, scene.sensor, session.camera)
+    highlights, _ = _judged(session, scene, radiance, light, _covering(session, scene))
     return sum(highlight.isolated for highlight in highlights) >= least
 
 
@@ -307,7 +309,7 @@ def _direct(radiance: Radiance, light: Image, scene: Scene, camera: Camera) -> I
     return collect(radiance.specular + radiance.diffuse, scene.sensor, camera)
 
 
-def _covering(session: Session, scene: Scene) -> npt.NDArray[np.uint8] | None:
+def _covering(session: Session, scene: Scene) -> Covering:
     """Return what covers the tissue (`RenderedView.covering`)."""
     if not scene.is_covered:
         return None
@@ -320,31 +322,33 @@ def _covering(session: Session, scene: Scene) -> npt.NDArray[np.uint8] | None:
     return covering
 
 
-def _undrawn(camera: Camera, covering: npt.NDArray[np.uint8] | None) -> Mask | None:
+def _undrawn(camera: Camera, covering: Covering) -> Mask | None:
     """Return the pixels of the view on which nothing is drawn; None where these are all."""
     drawn = None if covering is None else covering != DRAWN
     return camera.seen if drawn is None else drawn if camera.seen is None else camera.seen & drawn
 
 
-def _is_covered(point: HighlightPoint, covering: npt.NDArray[np.uint8] | None) -> bool:
-    """Return whether stool or what is drawn covers the pixel of a point."""
+def _uncovered(points: Sequence[HighlightPoint], covering: Covering) -> tuple[list[HighlightPoint], list[bool]]:
+    """Return points, hidden and not lit where stool or what is drawn covers their pixels, and whether it does."""
     if covering is None:
-        return False
-    column, row = np.minimum(point.bp_px.astype(int), [covering.shape[1] - 1, covering.shape[0] - 1])
-    return covering[row, column] not in (0, BILE)
+        return list(points), [False] * len(points)
+    last = [covering.shape[1] - 1, covering.shape[0] - 1]
+    pixels = [np.minimum(point.bp_px.astype(int), last) for point in points]
+    covered = [covering[row, column] not in (0, BILE) for column, row in pixels]
+    return [replace(p, lit=False, hidden=True) if over else p for p, over in zip(points, covered, strict=True)], covered
 
 
-def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) -> tuple[list[TrueHighlight], float]:
+def _judged(
+    session: Session, scene: Scene, radiance: Radiance, light: Image, covering: Covering
+) -> tuple[list[TrueHighlight], float]:
     """Judge a frame's highlights by its direct light behind the lens; return them and the full scale.
 
     The session is at the scene, or at one that differs from it in nothing but its sensor.
     """
     camera = session.camera
     direct = _direct(radiance, light, scene, camera)
-    points, rough = session.highlights(radiance), session.surface.relief is not None
-    covering = _covering(session, scene)
-    seen, covered = _undrawn(camera, covering), [_is_covered(point, covering) for point in points]
-    points = [replace(p, lit=False, hidden=True) if over else p for p, over in zip(points, covered, strict=True)]
+    (points, covered), seen = _uncovered(session.highlights(radiance), covering), _undrawn(camera, covering)
+    rough = session.surface.relief is not None
     examined = examine(points, mean_channel(direct), seen, single=rough)
     examined = [replace(e, why_not=COVERED) if over else e for e, over in zip(examined, covered, strict=True)]
     full_scale = _metered(scene, mean_channel(light), camera.seen)
@@ -371,14 +375,14 @@ def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) ->
 
 
 def _placed(
-    session: Session, radiance: Radiance, highlights: list[TrueHighlight]
+    session: Session, radiance: Radiance, highlights: list[TrueHighlight], covering: Covering
 ) -> tuple[list[TrueHighlight], Sequence[HighlightPoint]]:
     """Return highlights with their radii and the numbers of their clouds, and the clouds' centres."""
     radii = radii_px(session, highlights)
     if session.surface.relief is None:
         placed = [replace(h, radius_px=float(radii[i]), cloud=i) for i, h in enumerate(highlights)]
         return placed, placed
-    centres = session.base_highlights(radiance)
+    centres, _ = _uncovered(session.base_highlights(radiance), covering)
     numbers: list[int | None] = []
     if highlights:
         lights, pixels = np.array([h.light for h in highlights]), np.array([h.bp_px for h in highlights])

@@ -44,8 +44,8 @@ FIELDS = {
     "world_from_camera": "frame.json: the camera's pose, 4 x 4, mm; the world is the surface's own frame",
     "highlights": "frame.json: points where the fine normal bisects light and camera, camera frame, mm; radius_px by "
     "the surface's shape, the lobe and the lights' size, cloud an index in clouds, lit whether its light reaches it, "
-    "hidden whether metal covers it, peak_snr null without noise, why_not the first condition of an isolated "
-    "one that fails",
+    "hidden whether metal or `covering` covers it, peak_snr null without noise, why_not the first condition of an "
+    "isolated one that fails",
     "clouds": "frame.json: the same points of the base, without the relief; on a smooth surface the highlights",
     "visible_highlights": "frame.json: spots of the noise-free frame; value and specular are radiance, glints indices "
     "in highlights, area_px the pixels above half of the lobe's peak, light and cloud those of its brightest glint, or "

@@ -363,7 +363,7 @@ class Patches(Spec):
         8.0, ge=1, le=20, description="mean wavelength of the level, mm; a patch is about half as wide"
     )
     amplitude: float = Field(
-        2.0, gt=0, le=10, description="standard deviation of the level, in those of the relief's height"
+        2.0, gt=0, le=5, description="standard deviation of the level, in those of the relief's height"
     )
     dry_level: float = Field(
         -2.5, ge=-30, le=3, description="ground is dry where the level is lower, in deviations as the level itself"

@@ -144,7 +144,7 @@ def _sensor(scene: Scene) -> str:
 
 def _render(scene: Scene) -> str:
     parts = ["diffuse base"] if getattr(scene.reflectance, "diffuse", 0.0) else []
-    parts += ["bounced light"] if scene.render.path_depth > 2 else []
+    parts += ["bounced light"] if scene.render.path_depth > 2 or scene.render.ambient else []
     parts += ["instruments"] if scene.shown_instruments else []
     return ", ".join(parts) or "direct highlight alone"
 
@@ -397,6 +397,7 @@ def look_of(scene: Scene) -> str:
     """Return a hash of all of a scene that its frames show, but for seeds, viewpoint and rendering."""
     # Defaults are left out, so that a key that scenes get later changes no look.
     keys = scene.model_dump(mode="json", exclude={"name", "render"}, exclude_defaults=True)
+    keys |= {"ambient": True} if scene.render.ambient else {}
     surface, reflectance = keys.setdefault("surface", {}), keys.setdefault("reflectance", {})
     surface.pop("viewpoint", None)
     for table in (surface.get("relief"), reflectance.get("albedo"), keys.get("sensor"), keys.get("rig")):

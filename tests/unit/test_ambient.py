@@ -70,3 +70,16 @@ def test_a_plane_sends_itself_nothing():
 def test_traced_paths_beside_it_are_refused():
     with pytest.raises(InputError, match="path_depth = 3"):
         load_scene("plane", {"render.ambient": True, "render.path_depth": 3})
+
+
+def test_it_is_the_same_in_several_launches(monkeypatch):
+    whole = rendered(**{"render.ambient": True}).radiance.diffuse
+    monkeypatch.setattr("simtest.rendering.trace.LANES", 96 * 20)
+    np.testing.assert_allclose(rendered(**{"render.ambient": True}).radiance.diffuse, whole, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("width", "height"), [(40, 2), (1, 1)])
+def test_the_smallest_pictures_have_it_too(width, height):
+    size = {"camera.width": width, "camera.height": height, "camera.fx": 20.0, "camera.fy": 20.0}
+    plain, lit = (rendered(**size, **{"render.ambient": on}).radiance.diffuse for on in (False, True))
+    assert (lit > plain).all()

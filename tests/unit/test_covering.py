@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from simtest.dataset import read
+from simtest.dataset.maker import Maker
+from simtest.dataset.plan import Plan
 from simtest.dataset.shard_writer import write_dataset
-from simtest.dataset.verify import verify
+from simtest.dataset.verify import check_sample, verify
 from simtest.rendering import Session
 from simtest.runtime.processes import make_engine
 from simtest.simulation.frame import COVERED, make_frame, render_picture
@@ -69,6 +71,10 @@ def test_highlights_below_stool_and_below_what_is_drawn_are_hidden_and_all_other
             assert (point.hidden, point.why_not == COVERED) == (hidden, hidden)
             assert point.lit == (order[tuple(point.bp_px)].lit and not hidden)
         np.testing.assert_array_equal(made.truth.normal, clean.truth.normal)
+        below = np.isin(under(made, made.clouds), (1, 3))
+        assert [point.hidden for point in made.clouds] == below.tolist()
+        assert not any(point.lit and hidden for point, hidden in zip(made.clouds, below, strict=True))
+    assert any(point.hidden for name in ("debris", "box", "both") for point in frames[name].clouds)
     # A negative control: bile hides nothing.
     assert any(point.lit for point in frames["debris"].highlights if under(frames["debris"], [point])[0] == 2)
 
@@ -114,8 +120,14 @@ def test_samples_hold_the_map_where_their_scene_is_covered(tmp_path):
     ]
     described = {"name": "covered", "samples": 3, "samples_per_anatomy": 1, "highlights": 0, "families": families}
     described |= {"splits": {"train": 1, "validation": 0, "test": 0}, "estimators": ["cone_axis"]}
-    write_dataset(validate(Dataset, described, "covered"), tmp_path / "covered", make_engine())
+    recipe = validate(Dataset, described, "covered")
+    write_dataset(recipe, tmp_path / "covered", make_engine())
     assert verify(tmp_path / "covered") == []
+    maker = Maker(Plan(recipe))
+    soiled = next(each for each in map(maker.make, range(3)) if each.meta["anatomy"]["family"] == 0)
+    members = soiled.encode()
+    del members["covering.png"]
+    assert list(check_sample(members, soiled.meta)) == ["has no covering"]
     found = {record["meta"]["anatomy"]["family"]: record["covering"] for record in read(tmp_path / "covered")}
     assert {family: set(np.unique(values)) for family, values in found.items()} == {0: {0, 1}, 1: {0, 3}, 2: {0}}
     assert all(values.dtype == np.uint8 for values in found.values())

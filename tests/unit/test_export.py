@@ -193,6 +193,7 @@ def test_what_mitsuba_cannot_express_is_refused(tmp_path):
         "camera.fx = 81.0": scene(SURFACES["plane"], camera={"fx": 81.0}),
         "reflectance.albedo = 'stomach'": scene(SURFACES["plane"], {"type": "phong", "albedo": {"preset": "stomach"}}),
         "camera.skew = 2.0": scene(SURFACES["plane"], camera={"skew": 2.0}),
+        "render.ambient = True": scene(SURFACES["plane"], render={"ambient": True}),
         "rig.lights.1.profile = 'cos'": with_parts(
             described,
             rig=rig.model_copy(update={"lights": (ProfiledLight(), ProfiledLight(profile="cos"))}),

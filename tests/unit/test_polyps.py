@@ -104,7 +104,7 @@ def test_samples_hold_the_masks_of_drawn_polyps():
         np.testing.assert_array_equal(back, sample.images["polyp"])
         highest.append(int(back.max()))
         short = {**sample.meta, "polyps": listed[:1]}
-        assert any("names polyp" in fault for fault in check_sample(members, short)) == (highest[-1] > 1)
+        assert any("polyp has the value" in fault for fault in check_sample(members, short)) == (highest[-1] > 1)
         del members["polyp.png"]
         assert list(check_sample(members, sample.meta)) == ["has no polyp"]
     assert set(drawn) == {0, 12}

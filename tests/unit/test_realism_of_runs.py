@@ -72,6 +72,7 @@ def test_look_keeps_what_a_frame_shows_alone():
     unseen = {"surface.viewpoint": 9, "surface.relief.seed": 5, "sensor.seed": 3, "render.samples_per_pixel": 4}
     looks = {look_of(load_scene("tissue_colon", {key: value})) for key, value in unseen.items()}
     assert looks == {look_of(load_scene("tissue_colon"))}
+    assert look_of(load_scene("tissue_colon", {"render.ambient": True})) not in looks
     assert len({look_of(load_scene(name)) for name in ("tissue_colon", "tissue_stomach", "plane", "sphere")}) == 4
     assert (
         look_of(load_scene("tissue_colon", {"camera.width": 320, "camera.fx": 160.0, "camera.fy": 160.0})) not in looks
