@@ -210,66 +210,37 @@ def fit_arc(points: npt.ArrayLike) -> FittedArc | Failure:
 
 
 def _refined(xy: Array, p: Array) -> tuple[Array, Array] | None:
-    """Return the parameters of the least sum and their residuals; None where no ellipse or no minimum is reached.
-
-    The steps are those of MINPACK's lmder [More 1978], whose import takes longer than a picture.
-    """
-    f, J = _residuals(xy, p)
-    scale, damping, delta, moved = np.zeros(5), 0.0, np.inf, False
+    """Return parameters and residuals of the least sum, or None: by lmder's steps [More 1978], without its import."""
+    (f, J), scale, delta, moved = _residuals(xy, p), np.zeros(5), np.inf, False
     for _ in range(_ARC_EVALUATIONS - 1):
-        if not np.isfinite(J).all():
-            return None
         columns, size = np.linalg.norm(J, axis=0), float(np.linalg.norm(f))
         if size == 0 or np.max(np.abs(J.T @ f) / columns) <= _ARC_TOLERANCE * size:
             return p, f
+        if not np.isfinite(columns).all():
+            break
         scale = np.maximum(scale, columns)
-        reach = float(np.linalg.norm(scale * p))
         U, s, V = np.linalg.svd(J / scale, full_matrices=False)
-        b = -s * (U.T @ f)
-        damping = _damping(s, b, delta if moved else min(delta, 100 * reach), damping)
-        scaled = V.T @ (b / (s * s + damping))
-        step, length = scaled / scale, float(np.linalg.norm(scaled))
-        delta = delta if moved else min(delta, length)
+        b, damping = -s * (U.T @ f), 0.0
+        # least damping at which the step is no more than a tenth longer than the trusted one
+        while (length := float(np.linalg.norm(step := b / (s * s + damping)))) > 1.1 * delta:
+            damping += (length / delta - 1) * length**2 / np.sum(step**2 / (s * s + damping))
+        delta, step = delta if moved else length, V.T @ step / scale
         tried, slopes = _residuals(xy, p + step)
-        ratio = float(np.linalg.norm(tried)) / size
-        fall = 1 - ratio**2 if ratio < 10 else -1.0
-        linear, damped = (float(np.linalg.norm(J @ step)) / size) ** 2, damping * (length / size) ** 2
-        expected = linear + 2 * damped
+        ratio, damped = float(np.linalg.norm(tried)) / size, damping * (length / size) ** 2
+        linear = (float(np.linalg.norm(J @ step)) / size) ** 2
+        fall, expected = 1 - ratio**2 if ratio < 10 else -1.0, linear + 2 * damped
         gain = fall / expected if expected else 0.0
         if not gain > 0.25:
             share = 0.5 if fall >= 0 else 0.5 * (linear + damped) / (linear + damped - 0.5 * fall)
-            share = share if ratio < 10 and share >= 0.1 else 0.1
-            delta, damping = share * min(delta, 10 * length), damping / share
+            delta = (share if ratio < 10 and share >= 0.1 else 0.1) * min(delta, 10 * length)
         elif damping == 0 or gain >= 0.75:
-            delta, damping = 2 * length, damping / 2
+            delta = 2 * length
         if gain >= 1e-4:
-            p, f, J, moved, reach = p + step, tried, slopes, True, float(np.linalg.norm(scale * (p + step)))
-        if (max(abs(fall), expected) <= _ARC_TOLERANCE and gain <= 2) or delta <= _ARC_TOLERANCE * reach:
+            p, f, J, moved = p + step, tried, slopes, True
+        has_settled = max(abs(fall), expected) <= _ARC_TOLERANCE and gain <= 2
+        if has_settled or delta <= _ARC_TOLERANCE * np.linalg.norm(scale * p):
             return p, f
     return None
-
-
-def _damping(s: Array, b: Array, delta: float, damping: float) -> float:
-    """Return the damping d at which the step b / (s^2 + d) is about as long as `delta`; 0 where no step is longer."""
-
-    def at(d: float) -> tuple[float, float]:
-        """Return how much too long the step is, and what to add to d."""
-        square, length = s * s + d, np.linalg.norm(b / (s * s + d))
-        excess = float(length - delta)
-        return excess, float(excess * length**2 / (delta * np.sum((b / square) ** 2 / square)))
-
-    excess, low = at(0.0)
-    if excess <= 0.1 * delta:
-        return 0.0
-    high = float(np.linalg.norm(b)) / delta
-    damping = min(max(damping, low), high) or high
-    for _ in range(10):
-        excess, more = at(damping)
-        if abs(excess) <= 0.1 * delta:
-            break
-        low, high = (max(low, damping), high) if excess > 0 else (low, min(high, damping))
-        damping = max(low, damping + more)
-    return damping
 
 
 def angular_extent(vectors: Array) -> float:

@@ -210,8 +210,8 @@ def cell_pixels(truth: FrameTruth, surface: str) -> list[tuple[int, IntArray]]:
     held = []
     for numbers in in_cells:
         # Short integers are sorted by counting.
-        order, counts = np.argsort(numbers.astype(np.int16), kind="stable"), np.bincount(numbers + 1)
-        parts = np.split(order, np.cumsum(counts)[:-1])
+        order = np.argsort(numbers.astype(np.int16), kind="stable")
+        parts = np.split(order, np.cumsum(np.bincount(numbers + 1))[:-1])
         held += [(number - 1, part) for number, part in enumerate(parts) if number and len(part)]
     return held
 
