@@ -216,10 +216,10 @@ def _refined(xy: Array, p: Array) -> tuple[Array, Array] | None:
         columns, size = np.linalg.norm(J, axis=0), float(np.linalg.norm(f))
         if size == 0 or np.max(np.abs(J.T @ f) / columns) <= _ARC_TOLERANCE * size:
             return p, f
-        if not np.isfinite(columns).all():
-            break
         scale = np.maximum(scale, columns)
-        U, s, V = np.linalg.svd(J / scale, full_matrices=False)
+        if not np.isfinite(scaled := J / scale).all():
+            break
+        U, s, V = np.linalg.svd(scaled, full_matrices=False)
         b, damping = -s * (U.T @ f), 0.0
         # least damping at which the step is no more than a tenth longer than the trusted one
         while (length := float(np.linalg.norm(step := b / (s * s + damping)))) > 1.1 * delta:
