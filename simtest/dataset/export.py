@@ -20,7 +20,7 @@ from simtest.dataset.scoring.frames import (
     ExportedFrame,
     Frames,
     Record,
-    RenderedFrame,
+    ShownFrame,
     Source,
     Use,
     frames_of_cases,
@@ -282,16 +282,16 @@ def _check_folder(out: Path, option: str) -> None:
 def write_part(part: ExportPart, on_step: OnStep) -> list[WrittenFrame]:
     """Write the frames of a part, each with its preview and camera; call `on_step` after each."""
     made = []
-    for each in part.frames:
+    for each in part.frames.shown():
         made.append(_write_frame(each, part.out))
         on_step()
     write_json(part.kept, [each.model_dump(mode="json") for each in made], compact=True)
     return made
 
 
-def _write_frame(each: RenderedFrame, out: Path) -> WrittenFrame:
+def _write_frame(each: ShownFrame, out: Path) -> WrittenFrame:
     """Write a frame, its preview and its camera."""
-    image, sensor, told = each.image, each.sensor, each.view.calibration
+    image, sensor, told = each.image, each.sensor, each.calibration
     calibration = calibration_toml(told)
     name, camera = frame_name(image, calibration, each.isolated), _camera_name(calibration)
     file, data = _encoded(name, image, sensor)

@@ -338,15 +338,18 @@ PLATEAU_SHARE, BENT_SHARE = fitted_number("plateau.share"), fitted_number("plate
 BENT_RESIDUAL, MOST_BENT = fitted_number("plateau.bent_residual"), fitted_number("plateau.most_bent")
 
 
-def clipped_pixels(patch: Patch) -> Mask | None:
-    """Return the clipped pixels of a patch, and those as bright as they are, shape (h, w); None where there is none."""
+def clipped_pixels(patch: Patch, box: tuple[slice, slice] = np.s_[:, :]) -> Mask | None:
+    """Return the clipped pixels in a box of a patch, and those as bright as they are; None where there is none."""
     if patch.saturated is None or not patch.saturated.any():
         return None
-    raw = patch.values if patch.raw is None else patch.raw
-    inside = patch.saturated.astype(np.float32)
+    (top, bottom, _), (left, right, _) = map(slice.indices, box, patch.values.shape)
+    y, x = max(top - AROUND_PX, 0), max(left - AROUND_PX, 0)
+    around = np.s_[y : bottom + AROUND_PX, x : right + AROUND_PX]
+    saturated, raw = patch.saturated[around], (patch.values if patch.raw is None else patch.raw)[around]
+    inside = saturated.astype(np.float32)
     share, sums = (cv2.blur(each, (AROUND_PX, AROUND_PX)) for each in (inside, inside * raw.astype(np.float32)))
     nearly = (share > 0.5 / AROUND_PX**2) & (raw * share >= NEARLY_CLIPPED * sums)
-    return np.asarray(patch.saturated | nearly)
+    return np.asarray(saturated | nearly)[top - y : bottom - y, left - x : right - x]
 
 
 def plateau_area_px(patch: Patch, isovalue: float) -> int:

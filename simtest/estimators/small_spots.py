@@ -303,7 +303,7 @@ def _window(patch: Patch, half: int, reach: float, offsets: Array) -> tuple[Arra
     values[inner] = raw / patch.peak_value
     # candidates: seen pixels near the peak, and not of something else as bright
     used[inner] = np.isfinite(raw) if patch.seen is None else np.isfinite(raw) & patch.seen[crop]
-    used[inner] &= ~_of_others(patch)[crop]
+    used[inner] &= ~_of_others(patch, crop)
     near = np.sum(offsets**2, axis=0).reshape(side, side) <= reach**2
     for x, y in patch.neighbours_px - patch.peak_px:
         if x * x + y * y < (2 * reach) ** 2:
@@ -311,17 +311,18 @@ def _window(patch: Patch, half: int, reach: float, offsets: Array) -> tuple[Arra
             near &= (x * offsets[0] + y * offsets[1] < (x * x + y * y) / 2).reshape(side, side)
     used &= near
     values[~used] = 0.0
-    if (full := clipped_pixels(patch)) is not None:
-        clipped[inner] = full[crop]
+    if (shown := clipped_pixels(patch, crop)) is not None:
+        clipped[inner] = shown
     return values.ravel(), used.ravel(), (clipped & used).ravel()
 
 
-def _of_others(patch: Patch) -> Mask:
-    """Return the pixels outside the lowest isophote that closes that are as bright as it, shape (h, w)."""
+def _of_others(patch: Patch, box: tuple[slice, slice]) -> Mask:
+    """Return the pixels of a box outside the lowest isophote that closes that are as bright as it."""
+    values = patch.values[box]
     for isovalue in OTHER_ISOVALUES:
         if patch.area_px(isovalue) is not None:
-            return np.asarray((patch.values > isovalue * patch.peak_value) & ~patch.inside(isovalue))
-    return np.zeros(patch.values.shape, dtype=bool)
+            return np.asarray((values > isovalue * patch.peak_value) & ~patch.inside(isovalue)[box])
+    return np.zeros(values.shape, dtype=bool)
 
 
 def _spot(i: int, patch: Patch, camera: Camera, windows: SpotWindows, fits: SpotFits, radius: float) -> SmallSpot:

@@ -202,22 +202,45 @@ def fit_arc(points: npt.ArrayLike) -> FittedArc | Failure:
     centre = -np.linalg.solve(C[:2, :2], C[:2, 2])
     L = np.linalg.cholesky(C[:2, :2] / -(C[2, 2] + C[:2, 2] @ centre))
     first = np.array([*centre, L[0, 0], L[1, 0], L[1, 1]])
-    # Imported here: it takes longer to load than a picture to reconstruct, and not every picture has arcs.
-    from scipy.optimize import least_squares
-
-    # refine by Levenberg and Marquardt's method
     with np.errstate(all="ignore"):
-        # Residuals that are not finite make least_squares raise a ValueError.
-        try:
-            found = least_squares(
-                lambda p: _residuals(xy, p)[0], first, lambda p: _residuals(xy, p)[1], method="lm",
-                xtol=_ARC_TOLERANCE, ftol=_ARC_TOLERANCE, gtol=_ARC_TOLERANCE, max_nfev=_ARC_EVALUATIONS,
-            )  # fmt: skip
-        except ValueError:
-            return Failure(Reason.NOT_CONVERGED, "the arc's fit left the ellipses")
-    if not found.success:
+        found = _refined(xy, first)
+    if found is None:
         return Failure(Reason.NOT_CONVERGED, "the arc's fit did not converge")
-    return _checked_arc(xy, found.x, T, float(np.sqrt(np.mean(found.fun**2))))
+    return _checked_arc(xy, found[0], T, float(np.sqrt(np.mean(found[1] ** 2))))
+
+
+def _refined(xy: Array, p: Array) -> tuple[Array, Array] | None:
+    """Return parameters and residuals of the least sum, or None: by lmder's steps [More 1978], without its import."""
+    (f, J), scale, delta, moved = _residuals(xy, p), np.zeros(5), np.inf, False
+    for _ in range(_ARC_EVALUATIONS - 1):
+        columns, size = np.linalg.norm(J, axis=0), float(np.linalg.norm(f))
+        if size == 0 or np.max(np.abs(J.T @ f) / columns) <= _ARC_TOLERANCE * size:
+            return p, f
+        scale = np.maximum(scale, columns)
+        if not np.isfinite(scaled := J / scale).all():
+            break
+        U, s, V = np.linalg.svd(scaled, full_matrices=False)
+        b, damping = -s * (U.T @ f), 0.0
+        # least damping at which the step is no more than a tenth longer than the trusted one
+        while (length := float(np.linalg.norm(step := b / (s * s + damping)))) > 1.1 * delta:
+            damping += (length / delta - 1) * length**2 / np.sum(step**2 / (s * s + damping))
+        delta, step = delta if moved else length, V.T @ step / scale
+        tried, slopes = _residuals(xy, p + step)
+        ratio, damped = float(np.linalg.norm(tried)) / size, damping * (length / size) ** 2
+        linear = (float(np.linalg.norm(J @ step)) / size) ** 2
+        fall, expected = 1 - ratio**2 if ratio < 10 else -1.0, linear + 2 * damped
+        gain = fall / expected if expected else 0.0
+        if not gain > 0.25:
+            share = 0.5 if fall >= 0 else 0.5 * (linear + damped) / (linear + damped - 0.5 * fall)
+            delta = (share if ratio < 10 and share >= 0.1 else 0.1) * min(delta, 10 * length)
+        elif damping == 0 or gain >= 0.75:
+            delta = 2 * length
+        if gain >= 1e-4:
+            p, f, J, moved = p + step, tried, slopes, True
+        has_settled = max(abs(fall), expected) <= _ARC_TOLERANCE and gain <= 2
+        if has_settled or delta <= _ARC_TOLERANCE * np.linalg.norm(scale * p):
+            return p, f
+    return None
 
 
 def angular_extent(vectors: Array) -> float:

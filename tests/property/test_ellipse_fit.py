@@ -6,6 +6,7 @@ import pytest
 import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import least_squares
 from skimage.measure import EllipseModel
 
 from simtest.errors import Failure, InputError, Reason
@@ -282,6 +283,30 @@ def test_arcs_shrink_less_than_by_the_algebraic_fit(extent):
     bias = {name: abs(np.median(values) / 10 - 1) for name, values in lengths.items()}
     assert bias["arc"] < 0.02
     assert bias["algebraic"] > 2 * bias["arc"]
+
+
+def test_arcs_are_fitted_as_by_minpack():
+    """An independent check: MINPACK's lmder on the same residuals, over noise up to a seventh of the minor axis."""
+    rng, compared = np.random.default_rng(6), 0
+    for ratio, extent, noise in rng.uniform((0.3, 150, 0.01), (1, 330, 0.4), (60, 3)):
+        points = arc_points(10.0, 10.0 * ratio, extent, count=60) + noise * rng.normal(size=(60, 2))
+        arc, start = fit_arc(points), fit_ellipse(points)
+        assert isinstance(start, FittedConic)
+        if isinstance(arc, Failure):
+            continue
+        ellipse, T = ellipse_of_conic(start.normalised), start.normalised_from_image
+        cos, sin = np.cos(ellipse.angle), np.sin(ellipse.angle)
+        turn = np.array([[cos, -sin], [sin, cos]])
+        L = np.linalg.cholesky(turn @ np.diag([ellipse.semi_major**-2, ellipse.semi_minor**-2]) @ turn.T)
+        xy, p = points @ T[:2, :2].T + T[:2, 2], np.array([*ellipse.centre, L[0, 0], L[1, 0], L[1, 1]])
+        found = least_squares(lambda q, xy=xy: _residuals(xy, q)[0], p, method="lm", xtol=1e-12, ftol=1e-12)
+        L = np.array([[found.x[2], 0], found.x[3:]])
+        np.testing.assert_allclose(
+            -np.linalg.solve((C := arc.conic.normalised)[:2, :2], C[:2, 2]), found.x[:2], atol=1e-5
+        )
+        np.testing.assert_allclose(C[:2, :2] / C[0, 0], L @ L.T / (L @ L.T)[0, 0], rtol=1e-4, atol=1e-5)
+        compared += 1
+    assert compared > 50
 
 
 def test_short_arcs_lines_and_hyperbolas_are_refused():

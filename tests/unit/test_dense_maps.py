@@ -24,7 +24,7 @@ from simtest.dataset.scoring.dense.maps import (
 )
 from simtest.dataset.scoring.dense.score import frame_figures, joined_figures, score_frames, write_score
 from simtest.dataset.scoring.dense.shading import shading_maps
-from simtest.dataset.scoring.dense.truth import frame_truth, zones
+from simtest.dataset.scoring.dense.truth import BINS, CELLS, ZONES, _bin_names, cell_pixels, frame_truth, zones
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.geometry.axes import ALL, matrix
@@ -56,6 +56,23 @@ def test_normals_turned_by_one_degree_score_one_degree_in_every_cell(lens, tmp_p
     low, high = score.cell("normal")["ci95"]["median"]
     assert low == pytest.approx(1.0, abs=1e-9)
     assert high == pytest.approx(1.0, abs=1e-9)
+
+
+def test_each_cell_holds_its_pixels_in_order():
+    truth = sphere_truth()
+    held = dict(cell_pixels(truth, "fine"))
+    distance, zone = truth.distance[truth.scored], truth.zone[truth.scored]
+    for number, cell in enumerate(CELLS):
+        if cell.group == "zone" and cell.label != "all":
+            inside = zone == ZONES.index(cell.label)
+        elif cell.group == "distance_mm" and cell.scope == "everywhere":
+            names = _bin_names(BINS[cell.group])
+            low, high = BINS[cell.group][names.index(cell.label) :][:2]
+            inside = (distance >= low) & (distance < high)
+        else:
+            continue
+        assert np.array_equal(held.get(number, np.empty(0, int)), np.flatnonzero(inside))
+    assert np.array_equal(held[0], np.arange(len(zone)))
 
 
 @pytest.mark.parametrize(("bits", "tolerance"), [(16, 1e-3), (8, 0.1)])

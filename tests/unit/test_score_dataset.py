@@ -18,6 +18,7 @@ from simtest.dataset.scoring.frames import scored_frames
 from simtest.dataset.scoring.score import score_table
 from simtest.dataset.shard_writer import write_dataset
 from simtest.dataset.verify import verify
+from simtest.errors import InputError
 from simtest.runtime.processes import make_engine
 from simtest.runtime.resources import data_root
 from simtest.spec import calibration_toml, load_dataset, load_experiment
@@ -39,6 +40,19 @@ def made(tmp_path_factory):
     write_dataset(load_dataset("tiny", {"samples": FEW, "samples_per_anatomy": 1}), base / "data", make_engine())
     export_dataset(base / "data", base / "frames", make_engine())
     return base / "data", base / "frames"
+
+
+def test_an_export_reads_the_shards_and_renders_nothing(made, tmp_path, monkeypatch):
+    monkeypatch.setattr("simtest.dataset.maker.render_view", None)
+    shutil.copytree(made[0], tmp_path / "data")
+    export_dataset(tmp_path / "data", tmp_path / "frames", make_engine())
+    for file in made[1].rglob("*.*"):
+        assert file.read_bytes() == (tmp_path / "frames" / file.relative_to(made[1])).read_bytes()
+    # A picture that cannot be read is told in one line.
+    shard = next((tmp_path / "data").glob("*.tar"))
+    shard.write_bytes(shard.read_bytes().replace(b"IHDR", b"XXXX", 1))
+    with pytest.raises(InputError, match=f"{shard.name}.*--repair"):
+        export_dataset(tmp_path / "data", tmp_path / "again", make_engine())
 
 
 def test_an_exported_dataset_is_sound(made):

@@ -11,7 +11,7 @@ from simtest.calibration import Calibration, Frame
 from simtest.calibration.photometry import AngularProfile
 from simtest.errors import Failure, Reason
 from simtest.estimators.brightest_point import brightest_point
-from simtest.estimators.budget import plateau_area_px
+from simtest.estimators.budget import clipped_pixels, plateau_area_px
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
@@ -170,6 +170,15 @@ def test_what_is_clipped_is_told_where_the_falloff_was_divided_away(power):
     for peak, clipped in ((50, frame >= 1), (170, np.zeros(frame.shape, dtype=bool))):
         patch = Frame(frame, calibration, 1.0).patch((0, 0, 200, 100), (peak, 50))
         assert plateau_area_px(patch, 0.5) == pytest.approx(np.count_nonzero(clipped), rel=0.1)
+
+
+@pytest.mark.parametrize("box", [np.s_[8:29, 9:30], np.s_[0:13, 30:41], np.s_[20:37, 0:5]])
+def test_clipped_pixels_of_a_box_are_those_of_the_whole_there(box):
+    patch = patch_of(spot(sigma=(3.0, 3.0)) + spot(CENTRE - 14, (2.0, 2.0)), noise=0.05, level=0.6)
+    whole = clipped_pixels(patch)
+    assert 0 < whole.sum() < whole.size
+    assert (whole != patch.saturated).any()
+    assert np.array_equal(clipped_pixels(patch, box), whole[box])
 
 
 def test_what_is_fitted_is_kept_with_the_patch():

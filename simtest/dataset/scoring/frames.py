@@ -10,20 +10,22 @@ import numpy as np
 import polars as pl
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, model_validator
 
+from simtest.calibration import Calibration
 from simtest.conventions import ON_INSTRUMENT
 from simtest.dataset.manifest import NAME as MANIFEST
-from simtest.dataset.reader import open_manifest
-from simtest.dataset.sample_calibration import picture_sensor, stored_picture
+from simtest.dataset.reader import open_manifest, read_samples
+from simtest.dataset.sample_calibration import calibration_of, picture_sensor, stored_picture
 from simtest.dataset.shard_writer import maker_of
 from simtest.errors import InputError
 from simtest.estimators import AnyEstimator
+from simtest.reconstruction import reconstruct
 from simtest.reconstruction.records import Specularity
 from simtest.rendering import Session
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Image
 from simtest.runtime.files import read_json, require_plain, write_json
 from simtest.simulation.frame import RenderedView
-from simtest.spec import Experiment
+from simtest.spec import Experiment, Scene
 from simtest.spec.recipes import Dataset
 from simtest.spec.sensor import Sensor
 from simtest.spec.spec_model import validate
@@ -148,26 +150,36 @@ def image_hash(image: Image) -> str:
 
 
 @dataclass(frozen=True)
-class RenderedFrame:
-    """One frame, with the view that it is of."""
+class ShownFrame:
+    """One frame as reconstruction sees it, without the truth."""
 
     # index of the experiment's case and number of the realisation; of a dataset 0 and the sample's index
     case: int
     realisation: int
-    seed: int  # of the frame's noise
-    view: RenderedView  # the rendered scene: truth, true highlights, calibration
-    session: Session  # at the scene, until the next frame is taken
     setting: str  # of the experiment; of a dataset the split
-    swept: Mapping[str, Value]  # swept, pooled and drawn values by key path
     image: Image  # the frame as the estimators see it, float32, shape (H, W) or (H, W, 3)
     sensor: Sensor  # the sensor as whose values it is encoded
-    isolated: bool = True  # whether isolated highlights alone are detected and counted
-    anatomy: str = ""  # name of the dataset's anatomy that it shows; empty in a run
-    name: str = ""  # as in frames.csv, where it was exported
+    calibration: Calibration
+    full_scale: float
+    isolated: bool  # whether isolated highlights alone are detected and counted
 
     def detections(self) -> Sequence[Specularity]:
         """Detect the frame's highlights as a run does, without any estimator; none where no light reaches it."""
-        return answer(self.view, self.image, {}, self.isolated)
+        if self.full_scale <= 0:
+            return []
+        return reconstruct(self.image, self.calibration, {}, isolated=self.isolated, detector="peaks")
+
+
+@dataclass(frozen=True)
+class RenderedFrame(ShownFrame):
+    """One frame, with the view that it is of."""
+
+    seed: int  # of the frame's noise
+    view: RenderedView  # the rendered scene: truth, true highlights, calibration
+    session: Session  # at the scene, until the next frame is taken
+    swept: Mapping[str, Value]  # swept, pooled and drawn values by key path
+    anatomy: str = ""  # name of the dataset's anatomy that it shows; empty in a run
+    name: str = ""  # as in frames.csv, where it was exported
 
 
 class Frames(Protocol):
@@ -184,6 +196,9 @@ class Frames(Protocol):
     def __len__(self) -> int: ...
 
     def __iter__(self) -> Iterator[RenderedFrame]: ...
+
+    def shown(self) -> Iterator[ShownFrame]:
+        """Yield the frames in the same order; rendered only where they are not stored."""
 
     def score(self, frame: RenderedFrame, estimators: Mapping[str, AnyEstimator], item: Path | None) -> list[Row]:
         """Score the estimators' answers to one of the frames; keep it for the gallery where `item` names a file."""
@@ -212,9 +227,11 @@ class CaseFrames:
             view, drawn = realiser.view(experiment, case, number)
             seed = case.noise_seed(experiment, number)
             yield RenderedFrame(
-                self.case, number, seed, view, realiser.session, case.setting, {**case.swept, **drawn},
-                view.frame(seed), view.scene.sensor, case.isolated,
+                self.case, number, case.setting, view.frame(seed), view.scene.sensor, view.calibration, view.full_scale,
+                case.isolated, seed, view, realiser.session, {**case.swept, **drawn},
             )  # fmt: skip
+
+    shown = __iter__  # nothing is stored
 
     def score(self, frame: RenderedFrame, estimators: Mapping[str, AnyEstimator], item: Path | None) -> list[Row]:
         """Score one of the frames as a run does."""
@@ -227,12 +244,13 @@ class CaseFrames:
 
 @dataclass(frozen=True)
 class ShardFrames:
-    """The frames of one shard of a dataset, of which there are `count`; `variant` is Mitsuba's.
+    """The frames of one shard, a file, of a dataset, of which there are `count`; `variant` is Mitsuba's.
 
     The dataset's own estimators are not needed, and may not even be installed.
     """
 
     dataset: Dataset
+    shard: Path
     key: int
     count: int
     variant: str
@@ -250,12 +268,18 @@ class ShardFrames:
                 for key, value in drawn.values.items()
             }
             sensor, anatomy = drawn.scene.sensor, drawn.anatomy
-            picture = stored_picture(view.frame(sensor.seed), sensor)
+            picture = np.divide(stored_picture(view.frame(sensor.seed), sensor), np.float32(255), dtype=np.float32)
             yield RenderedFrame(
-                self.case, index, sensor.seed, view, session, maker.plan.split(index), values,
-                np.asarray(picture / np.float32(255), dtype=np.float32), picture_sensor(sensor),
-                anatomy=f"{anatomy.family}.{anatomy.number}",
+                self.case, index, maker.plan.split(index), picture, picture_sensor(sensor), view.calibration,
+                view.full_scale, True, sensor.seed, view, session, values, f"{anatomy.family}.{anatomy.number}",
             )  # fmt: skip
+
+    def shown(self) -> Iterator[ShownFrame]:
+        """Yield the frames as the shard holds them."""
+        for sample in read_samples(self.shard.parent, fields=["image"], shards=[self.shard.name]):
+            meta, sensor = sample.meta, picture_sensor(Scene.model_validate(sample.meta["scene"]).sensor)
+            picture, told = np.divide(sample.images["image"], np.float32(255), dtype=np.float32), calibration_of(meta)
+            yield ShownFrame(self.case, meta["index"], meta["split"], picture, sensor, told, meta["full_scale"], True)
 
     def score(self, frame: RenderedFrame, estimators: Mapping[str, AnyEstimator], item: Path | None) -> list[Row]:
         """Score one of the frames as the dataset's maker does; no dataset has a gallery."""
@@ -331,7 +355,10 @@ def source_of_dataset(folder: Path) -> Source:
     manifest = open_manifest(folder)
     plan, variant = manifest.plan(), str(manifest.origin["variant"])
     bare = plan.dataset.model_copy(update={"estimators": ()})
-    parts = [ShardFrames(bare, number, len(shard.indices), variant) for number, shard in enumerate(plan.shards)]
+    parts = [
+        ShardFrames(bare, folder / shard.name, number, len(shard.indices), variant)
+        for number, shard in enumerate(plan.shards)
+    ]
     is_of = hashlib.sha256(plan.dataset.model_dump_json().encode()).hexdigest()
     version, source = provenance.version(), str(manifest.origin["source"])
     return Source(folder, parts, "dataset", version, source, is_of, variant, plan.dataset)

