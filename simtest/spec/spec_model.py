@@ -22,8 +22,14 @@ Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9_-
 
 Share = Annotated[float, Field(ge=0, le=1)]
 
+
+def unsaid_at(default: object) -> dict[str, Any]:
+    """Return what a key's Field takes that came later: a model with the default is written as it was before."""
+    return {"exclude_if": lambda value: value == default}
+
+
 UNSAID: dict[str, Any] = {"exclude_if": lambda value: not value}
-"""For keys that came later: a model without them is written as it was before."""
+"""The same where the default is 0, none or empty."""
 
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from simtest.errors import InputError
 from simtest.runtime.resources import find
-from simtest.spec.spec_model import Share, Spec, validate
+from simtest.spec.spec_model import UNSAID, Share, Spec, unsaid_at, validate
 from simtest.spec.toml_files import apply_settings, read_toml, source_name
 
 Coordinate = Annotated[float, Field(ge=-1e3, le=1e3)]
@@ -31,7 +31,7 @@ class Polyp(Spec):
     height_mm: float = Field(4.0, ge=0.2, le=20, description="height over the wall, mm")
     width_mm: float = Field(8.0, ge=1, le=40, description="width at half height; of a pedunculated one its head's, mm")
     steepness: float = Field(
-        0.0, ge=0, le=10, description="of a sessile one's side; 0: Gaussian, above: more of a dome"
+        0.0, ge=0, le=10, description="of a sessile one's side; 0: Gaussian, above: more of a dome", **UNSAID
     )
     neck_mm: float | None = Field(None, ge=0.5, le=30, description="width of the neck, mm; none given: sessile")
 
@@ -65,26 +65,38 @@ class ColonRecipe(Spec):
     sway_deg: float = Field(8.0, ge=0, le=45, description="amplitude of the heading's oscillation, deg")
     sway_length_mm: float = Field(90.0, ge=20, le=1000, description="period of the heading's oscillation, mm")
     taenia_mm: float = Field(0.8, ge=0, le=5, description="amplitude of the three-fold modulation of the radius, mm")
-    taenia_ridge_mm: float = Field(0.0, ge=0, le=5, description="height of a ridge along each taenia, mm")
+    taenia_ridge_mm: float = Field(0.0, ge=0, le=5, description="height of a ridge along each taenia, mm", **UNSAID)
     fold_depth_mm: float = Field(7.0, ge=0, le=30, description="mean height of a fold over the wall, mm")
     # Where two folds run into each other the edge is sharper than either's own: about half of this at worst.
     fold_edge_mm: float = Field(4.5, ge=0.5, le=10, description="mean radius of curvature of a lone fold's edge, mm")
     fold_spacing_mm: float = Field(22.0, ge=5, le=100, description="mean distance between rings of folds, mm")
     fold_stagger: float = Field(
-        0.0, ge=0, le=0.5, description="how far along each row of folds stands from its neighbour, over fold_spacing_mm"
+        0.0,
+        ge=0,
+        le=0.5,
+        description="how far along each row of folds stands from its neighbour, over fold_spacing_mm",
+        **UNSAID,
     )
     fold_concentration: float = Field(4.0, ge=0, le=50, description="how short a fold is around the tube; 0: a ring")
     irregularity: float = Field(0.25, ge=0, le=0.5, description="relative spread of depth, edge radius and position")
-    closed: bool = Field(False, description="whether rounded ends, radius_mm deep, close the tube beyond length_mm")
-    crease_mm: float = Field(0.0, ge=0, le=3, description="mean height of the fine folds between the large ones, mm")
+    closed: bool = Field(
+        False, description="whether rounded ends, radius_mm deep, close the tube beyond length_mm", **UNSAID
+    )
+    crease_mm: float = Field(
+        0.0, ge=0, le=3, description="mean height of the fine folds between the large ones, mm", **UNSAID
+    )
     crease_spacing_mm: float = Field(
-        6.0, ge=2, le=50, description="mean distance between fine folds along the tube, mm"
+        6.0, ge=2, le=50, description="mean distance between fine folds along the tube, mm", **unsaid_at(6.0)
     )
     polyps: tuple[Polyp, ...] = Field((), max_length=20, description="polyps")
-    polyp_count: int = Field(0, ge=0, le=20, description="further polyps, whose places and sizes are drawn")
-    polyp_smallest_mm: float = Field(3.0, ge=1, le=20, description="least width_mm of those, even in the logarithm")
-    polyp_largest_mm: float = Field(15.0, ge=1, le=20, description="largest width_mm of those, where there is room")
-    polyp_stalked: Share = Field(0.3, description="share of those that are pedunculated")
+    polyp_count: int = Field(0, ge=0, le=20, description="further polyps, whose places and sizes are drawn", **UNSAID)
+    polyp_smallest_mm: float = Field(
+        3.0, ge=1, le=20, description="least width_mm of those, even in the logarithm", **unsaid_at(3.0)
+    )
+    polyp_largest_mm: float = Field(
+        15.0, ge=1, le=20, description="largest width_mm of those, where there is room", **unsaid_at(15.0)
+    )
+    polyp_stalked: Share = Field(0.3, description="share of those that are pedunculated", **unsaid_at(0.3))
     relief_mm: float = Field(0.0, ge=0, le=0.2, description="amplitude of each wave of the mucosa's fine relief, mm")
     relief_length_mm: float = Field(4.0, ge=2, le=30, description="mean wavelength of the relief, mm")
     seed: int = Field(0, ge=0, lt=2**32, description="seed of the irregularities")
