@@ -63,7 +63,7 @@ def main() -> None:
     columns, shares = [], []
     for number, (seen, judged) in enumerate(folds, 1):
         of = recipe if options.as_it_is else fitted(recipe, [*old, *seen], options, number)
-        black = generate(of, options.count, options.out / f"fold{number}", options.as_it_is and number == 2)
+        black = generate(of, options.count, options.out / f"fold{number}", number == 2)
         made.append(open_frames([options.out / f"fold{number}"]))
         found = compare(judged, made[-1])
         columns.append([f"{distance_text(d.distance)}, {d.verdict}" for d in found.distances])
