@@ -61,6 +61,7 @@ class Field:
             "relief": has_relief(meta),
             "polyps": bool(meta.get("polyps")),
             "instruments": bool(meta["scene"].get("instruments")),
+            # Datasets from before the map have captions without it.
             "covered": has_debris(meta),
             "asked": False,
         }[self.stored]

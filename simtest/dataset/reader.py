@@ -47,7 +47,7 @@ def read(
     dict
         Array by field name (units and frames in the card), and ``meta``: the sample's metadata. Where there is no
         relief, ``normal_base`` and ``curvature_base`` are the arrays ``normal`` and ``curvature``, and ``pool`` is
-        false. Where there are no instruments or polyps, ``instrument`` or ``polyp`` is 0.
+        false. Where nothing of theirs is stored, ``instrument``, ``polyp`` and ``covering`` are 0.
 
     Raises
     ------

@@ -515,19 +515,21 @@ class Tube:
             exponent = -(x**2) / (2 * w2) + fold.kappa * (cosine - 1)
             # Derivatives of the exponent E; x_v = -slant cos.
             eu, ev = -x / w2, x * fold.slant * cosine / w2 - fold.kappa * sine
-            euu: Array | float = -1 / w2
-            euv = fold.slant * cosine / w2
-            evv = -((fold.slant * cosine) ** 2 + x * fold.slant * sine) / w2 - fold.kappa * cosine
             if fold.steep:
-                turn, twice = 1 - 2 * fold.steep * exponent, 2 * fold.steep
-                euu, euv, evv = turn * euu - twice * eu**2, turn * euv - twice * eu * ev, turn * evv - twice * ev**2
-                exponent, eu, ev = exponent - fold.steep * exponent**2, turn * eu, turn * ev
+                turn, a, b = 1 - 2 * fold.steep * exponent, eu, ev
+                exponent, eu, ev = exponent - fold.steep * exponent**2, turn * a, turn * b
             bump = fold.depth * np.exp(exponent)
             f -= bump
             fu -= bump * eu
             fv -= bump * ev
             if not second:
                 continue
+            euu: Array | float = -1 / w2
+            euv = fold.slant * cosine / w2
+            evv = -((fold.slant * cosine) ** 2 + x * fold.slant * sine) / w2 - fold.kappa * cosine
+            if fold.steep:
+                twice = 2 * fold.steep
+                euu, euv, evv = turn * euu - twice * a**2, turn * euv - twice * a * b, turn * evv - twice * b**2
             fuu -= bump * (eu * eu + euu)
             fuv -= bump * (eu * ev + euv)
             fvv -= bump * (ev * ev + evv)
