@@ -365,7 +365,7 @@ def of_smooth(frames: int, seed: int) -> list[Detected]:
 
 
 def of_tissue(frames: int, seed: int) -> list[Detected]:
-    """Return the highlights of frames of the recipe `endoscopy`, as `studies.one_light` draws and tells them."""
+    """Return the highlights of frames of the recipe `endoscopy_close`, as `studies.one_light` draws and tells them."""
     plan, made = OneLight(seed, frames), list[Detected]()
     for number in range(frames):
         drawn_frame = rendered(plan, number)

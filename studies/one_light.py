@@ -3,8 +3,8 @@
     python -m studies.one_light [FRAMES] [SEED] [ROWS.json]
     python -m studies.one_light --base [FRAMES] [SEED] [ROWS.json]
 
-Frames are those of the recipe `endoscopy` through its camera chains, with a seed of this study alone: colon, stomach,
-liver and gallbladder in equal shares, under the first light of their scope alone, which in every second frame stands at
+Frames are those of the recipe `endoscopy_close` through its camera chains, with a seed of this study alone: all organs
+in equal shares, under the first light of their scope alone, which in every second frame stands at
 the camera; the relief's slope is drawn anew, from 2 to 8 deg. What is told is the camera, the light, and the scope's
 working range; a light beside the camera is also judged with a told distance. The best estimates are scored by
 kind of highlight. "Before" is the same picture without room for near misses
@@ -82,9 +82,10 @@ class OneLight(Plan):
     """The recipe's scenes under one light, with slopes of their own."""
 
     def __init__(self, seed: int, frames: int) -> None:
-        recipe = load_dataset("endoscopy")
+        recipe = load_dataset("endoscopy_close")
         families = tuple(family.model_copy(update={"weight": 1.0}) for family in recipe.families)
-        update = {"seed": seed, "samples": frames, "samples_per_anatomy": 1, "families": families}
+        # The name, of which the draws depend, is that under which the tables were made.
+        update = {"name": "endoscopy", "seed": seed, "samples": frames, "samples_per_anatomy": 1, "families": families}
         super().__init__(recipe.model_copy(update=update))
 
     def draw(self, index: int, attempt: int = 0) -> Drawn:

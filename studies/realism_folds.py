@@ -46,7 +46,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("frames", type=Path)
     parser.add_argument("old", type=Path, nargs="*")
-    parser.add_argument("--recipe", default="endoscopy")
+    parser.add_argument("--recipe", default="endoscopy_close")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--size", type=int, default=150, help="radiances of the fit's bank")
     parser.add_argument("--count", type=int, default=24, help="generated frames of each fold")

@@ -42,7 +42,7 @@ AIMED_AT = (0.92, 0.98)
 """Share of the 95 % regions of each cell that must contain the truth."""
 
 ALBEDOS = ((0.66, 0.29, 0.19), (0.66, 0.28, 0.17), (0.20, 0.04, 0.033), (0.72, 0.47, 0.31))
-"""Linear RGB of the base by organ, as in the recipe `endoscopy`."""
+"""Linear RGB of the base by organ, as in the recipe `endoscopy_close`."""
 
 STRETCHES = (0.6, 1.6)
 """Factors of the relief's wavelengths; it was tuned on 0.7 to 1.5."""

@@ -2,7 +2,7 @@
 
 The wall is the quadric at the highlight, so that its distance can be set: its principal curvatures are drawn from those
 of the highlights of the generated anatomies (middle 80 %, `simtest validate mesh` with all highlight points), and its
-relief and film from the ranges of the dataset recipe `endoscopy`. Twins widen these, since no two patients are alike.
+relief and film from the ranges of the dataset recipe `endoscopy_close`. Twins widen these, as patients are not alike.
 The wavelengths matter most to them: they are the only scale of length that a picture shows, so they decide at which
 distance a twin looks like the real highlight, and the error from a light beside the lens goes with 1 / distance.
 """
@@ -24,7 +24,7 @@ from simtest.spec.toml_files import read_toml
 MOST_TILT_DEG = 35.0
 """The wall is tilted by up to so much against the picture's plane, towards any side."""
 
-RECIPE = "endoscopy"
+RECIPE = "endoscopy_close"
 """Dataset recipe whose ranges of relief and film are drawn from."""
 
 MESHES_IN_VIEW = 8.0

@@ -171,7 +171,7 @@ UNTOLD_FALLOFF_POWER = Assumed(0.0, 4.0)
 
 UNTOLD_SLOPE_RAD = Assumed(math.radians(3.0), math.radians(20.0))
 """Slope of the relief an axis, rad, where none is told: one frame hardly tells it. The recipes have 1.4 to 9 deg
-(scenes/datasets/endoscopy.toml), and highlights of a colon's phantom lie wider than such slopes make them."""
+(scenes/datasets/endoscopy_close.toml), and highlights of a colon's phantom lie wider than such slopes make them."""
 
 
 @dataclass(frozen=True)

@@ -69,8 +69,8 @@ def make(
     Parameters
     ----------
     described : str
-        A dataset file, or the name of a shipped one: endoscopy, highlights, highlights_smooth,
-        highlights_tiny, smooth, tiny.
+        A dataset file, or the name of a shipped one: endoscopy, endoscopy_close, highlights,
+        highlights_smooth, highlights_tiny, smooth, tiny.
     """
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS, write_dataset
     from simtest.rendering.backend import needs_gpu
