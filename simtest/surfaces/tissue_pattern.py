@@ -161,15 +161,10 @@ _NESTED: dict[str, Any] = {"mottling": Lattice, "capillaries": Lattice, "vessels
 
 def make_pattern(surface: SurfaceModel, spec: TissueColour) -> TissuePattern:
     """Make the pattern of a surface; the last few are cached."""
-    if spec.debris is not None:
-        return replace(make_pattern(surface, spec.model_copy(update={"debris": None})), debris=_debris(spec))
-    if not spec.vessels.strength:
-        # Mottling and capillaries fill space: without visible vessels all surfaces have the same pattern.
-        return _bare(spec)
-    return _make(surface_patch(surface), spec)
+    # Mottling and capillaries fill space: without visible vessels all surfaces have the same pattern.
+    return _make(surface_patch(surface) if spec.vessels.strength else None, spec)
 
 
-@remembered
 def _debris(spec: TissueColour) -> DebrisPattern:
     """Draw what lies on tissue; of space its shares are exact."""
     assert spec.debris is not None
@@ -184,13 +179,12 @@ def _debris(spec: TissueColour) -> DebrisPattern:
 
 
 @remembered
-def _bare(spec: TissueColour) -> TissuePattern:
-    """Make the pattern without vessels."""
-    return _pattern(spec, NO_VESSELS)
-
-
-@remembered
-def _make(patch: PatternPatch, spec: TissueColour) -> TissuePattern:
+def _make(patch: PatternPatch | None, spec: TissueColour) -> TissuePattern:
+    if spec.debris is not None:
+        bare = _make(patch, spec.model_copy(update={"debris": None}))
+        return replace(bare, debris=_debris(spec)) if spec.debris.stool or spec.debris.bile else bare
+    if patch is None:
+        return _pattern(spec, NO_VESSELS)
     return _unpacked(kept("tissue", f"{patch.key} {spec.model_dump_json()}", lambda: _packed(_grown(patch, spec))))
 
 

@@ -296,6 +296,7 @@ def _quadric(surface: Quadric) -> PatternPatch:
     return PatternPatch(f"quadric {k1!r} {k2!r} {half!r}", float(secant.mean()) * 4 * half**2, draw)
 
 
+@remembered
 def _mesh(mesh: TriangleMesh, key: str) -> PatternPatch:
     areas = np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1) / 2
     total = np.cumsum(areas)

@@ -50,9 +50,11 @@ def _film(bsdf: Any, wi: Any, wo: Any, alpha: Any) -> tuple[Any, Any]:
 
 def _values(bsdf: Any, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
     """Compute f cos(theta) and the sampling density of the enabled parts."""
-    active &= (si.wi.z > 0) & (wo.z > 0)
-    # Other lanes compute with a direction of their own, so that no derivative is NaN.
-    wi, wo = dr.select(active, si.wi, mi.Vector3f(0, 0, 1)), dr.select(active, wo, mi.Vector3f(0, 0, 1))
+    facing = si.wi.z > 0
+    active &= facing & (wo.z > 0)
+    # Other lanes compute with a direction of their own, so that no derivative is NaN. That to the camera is the same for
+    # all lights, so that its terms are computed once.
+    wi, wo = dr.select(facing, si.wi, mi.Vector3f(0, 0, 1)), dr.select(active, wo, mi.Vector3f(0, 0, 1))
     value, density = mi.Spectrum(0), mi.Float(0)
     share = bsdf._share(ctx, si, wi, active)
     glossy, diffuse = bsdf._enabled(ctx)
