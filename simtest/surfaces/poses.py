@@ -1,8 +1,8 @@
 """Camera poses by number, and along a path through a lumen; never in tissue.
 
-The same label and number give the same pose. A path follows the centreline of a closed tube. In another lumen the inside
-is sampled on a grid; the path joins the two cells that are farthest apart, by the route that keeps farthest from the
-wall, and is then smoothed.
+The same label and number give the same pose. In a closed tube a path follows the centreline. The inside of another
+lumen is sampled on a grid; the path joins the two cells that are farthest apart, by the route that keeps farthest from
+the wall, and is then smoothed.
 """
 
 import math

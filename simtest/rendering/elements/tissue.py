@@ -52,8 +52,8 @@ def _values(bsdf: Any, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, An
     """Compute f cos(theta) and the sampling density of the enabled parts."""
     facing = si.wi.z > 0
     active &= facing & (wo.z > 0)
-    # Other lanes compute with a direction of their own, so that no derivative is NaN. That to the camera is the same for
-    # all lights, so that its terms are computed once.
+    # Other lanes compute with a direction of their own, so that no derivative is NaN. That to the camera is the same
+    # for all lights, so that its terms are computed once.
     wi, wo = dr.select(facing, si.wi, mi.Vector3f(0, 0, 1)), dr.select(active, wo, mi.Vector3f(0, 0, 1))
     value, density = mi.Spectrum(0), mi.Float(0)
     share = bsdf._share(ctx, si, wi, active)
