@@ -197,8 +197,9 @@ def contrast(image: Image, component: Component, peak: float, seen: Mask | None 
     rows, columns = np.nonzero(component.mask)
     outside[rows + component.y - top, columns + component.x - left] = False
     around = image[box][outside]
-    least = image.min() if seen is None else image.min(where=seen, initial=np.inf)
-    return peak - float(median(around) if around.size else least)
+    if around.size:
+        return peak - float(median(around))
+    return peak - float(image.min() if seen is None else image.min(where=seen, initial=np.inf))
 
 
 def grown_box(corner: tuple[int, int], size: tuple[int, int], shape: tuple[int, ...]) -> Box:

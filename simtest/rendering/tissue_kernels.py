@@ -230,9 +230,9 @@ HEADER = 64
 PACKET = 4
 """Numbers that one gather reads."""
 
-FALL, TURN, PER_MM, MASK, ROWS, HALF = 6, 32, 50, 51, 52, 53
+FALL, TURN, PER_MM, MASK, ROWS, HALF, LISTED = 6, 32, 50, 51, 52, 53, 56
 """Where the header holds how fast vessels fade with depth (of each channel), both lattices' turns, cells over mm, what
-of a hash is the slot, the first row, and half-sizes beyond which vessels are mirrored."""
+of a hash is the slot, the first row, half-sizes beyond which vessels are mirrored, and where the lists start."""
 
 
 class AlbedoKernel:
@@ -249,15 +249,18 @@ class AlbedoKernel:
         self._nodes = len(pattern.mottling.values)
         table = pattern.vessels
         self._is_mirrored, self._is_layered = bool((table.half_mm < ENDLESS).any()), bool(pattern.fall.any())
-        first = np.zeros(-(-len(table.first) // PACKET) * PACKET, dtype=np.float32)
-        first.view(np.uint32)[: len(table.first)] = table.first
+        first, listed = (
+            np.pad(part, (0, -len(part) % PACKET)).view(np.float32) for part in (table.first, table.listed)
+        )
         debris = [] if (own := pattern.debris) is None else [own.numbers.astype(np.float32), _packets(own.field)]
-        parts = [_header(pattern), *(_packets(lattice) for lattice in lattices), *debris, first, table.rows.ravel()]
-        # The sizes of all but the last two are the same for all patterns.
+        parts = [_header(pattern), *(_packets(lattice) for lattice in lattices), *debris]
+        parts += [first, table.rows.ravel(), listed]
+        # The sizes of all but the last three are the same for all patterns.
         self._lattices = [sum(map(len, parts[: 1 + i])) // PACKET for i in range(len(lattices))]
         self._debris = sum(map(len, parts[:3]))
-        self._first = sum(map(len, parts[:-2]))
-        parts[0].view(np.uint32)[ROWS] = sum(map(len, parts[:-1])) // PACKET
+        self._first = sum(map(len, parts[:-3]))
+        parts[0].view(np.uint32)[ROWS] = sum(map(len, parts[:-2])) // PACKET
+        parts[0].view(np.uint32)[LISTED] = sum(map(len, parts[:-1]))
         self._buffer = mi.Float(np.concatenate(parts))
 
     def of(self, si: Any, active: Any) -> Any:
@@ -332,12 +335,13 @@ class AlbedoKernel:
         parts = [mi.UInt32(cell[axis]) * prime for axis, prime in enumerate(PRIMES)]
         slot = (parts[0] ^ parts[1] ^ parts[2]) & self._whole(mi.UInt32(MASK))
         row, last = (self._whole(self._first + slot + i, active) for i in range(2))
-        # A row is two packets.
-        rows = self._whole(mi.UInt32(ROWS))
-        row, last = rows + 2 * row, rows + 2 * last
+        rows, listed = (self._whole(mi.UInt32(i)) for i in (ROWS, LISTED))
+        row, last = row + listed, last + listed
 
         def step(row: Any, artery: Any, vein: Any, *sums: Any) -> tuple[Any, ...]:
-            start, along = self._packet(row, active), self._packet(row + 1, active)
+            # A row is two packets.
+            place = rows + 2 * self._whole(row, active)
+            start, along = self._packet(place, active), self._packet(place + 1, active)
             gap, d = p - mi.Vector3f(*start[:3]), mi.Vector3f(*along[:3])
             t = dr.clip(dr.dot(gap, d) / dr.squared_norm(d), 0, 1)
             inside = dr.maximum(1 - dr.squared_norm(gap - t * d) / (start[3] * start[3]), 0)
@@ -348,7 +352,7 @@ class AlbedoKernel:
                 depth, weights = dr.safe_sqrt(squared) / BLUR_PER_DEPTH, (dr.maximum(chord, 0), dr.maximum(-chord, 0))
                 parts = [part for weight in weights for part in (weight, weight * depth)]
                 sums = tuple(total + part for total, part in zip(sums, parts, strict=True))
-            return row + 2, dr.maximum(artery, chord), dr.maximum(vein, -chord), *sums
+            return row + 1, dr.maximum(artery, chord), dr.maximum(vein, -chord), *sums
 
         sums = [mi.Float(0)] * (6 if self._is_layered else 2)
         state = (row, *sums)

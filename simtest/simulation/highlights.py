@@ -82,7 +82,7 @@ def _record(highlight: object, names: Sequence[str]) -> dict[str, Json]:
     record: dict[str, Json] = {}
     for name in names:
         value = getattr(highlight, name)
-        if isinstance(value, np.ndarray | tuple):
+        if isinstance(value, (np.ndarray, tuple)):
             value = np.asarray(value).tolist()
         elif value == "" or (isinstance(value, float) and not math.isfinite(value)):
             value = None
@@ -220,15 +220,13 @@ def examine(
     """
     # The maximum that each point makes in the frame as detectors see it, and whose it is.
     smoothed = smooth(light, DEFAULT_SMOOTHING_PX, seen)
-    peaks = [_peak_pixel(smoothed, point) for point in points]
+    peaks = _peak_pixels(smoothed, points)
     owners = _owners(points, peaks)
-    lit = [point for point in points if point.lit] if single else []
-    pixels = np.array([point.bp_px for point in lit]).reshape(-1, 2).astype(int)
-    examined = []
-    for point, peak in zip(points, peaks, strict=True):
-        others = pixels[[other is not point for other in lit]] if single and owners.get(peak) is point else pixels[:0]
-        examined.append(_examined(point, smoothed, seen, peak, owners.get(peak) is point, others))
-    return examined
+    lit = np.array([point.bp_px for point in points if point.lit and single]).reshape(-1, 2).astype(int)
+    return [
+        _examined(point, smoothed, seen, peak, owners.get(peak) is point, lit)
+        for point, peak in zip(points, peaks, strict=True)
+    ]
 
 
 def verdicts(
@@ -267,7 +265,7 @@ def lobe_region(point: HighlightPoint, specular: Image, at_point: float) -> tupl
     more: a highlight smaller than a pixel has none that reaches half of it, and no region. `specular` is the lobe's
     noise-free light before the lens, shape (H, W).
     """
-    row, column = _peak_pixel(specular, point)
+    [(row, column)] = _peak_pixels(specular, [point])
     brightest = float(specular[row, column])
     peak = max(at_point, brightest)
     level = HIGHLIGHT_ISOVALUE * peak
@@ -276,23 +274,21 @@ def lobe_region(point: HighlightPoint, specular: Image, at_point: float) -> tupl
 
 def _owners(points: Sequence[HighlightPoint], peaks: list[Pixel]) -> dict[Pixel, HighlightPoint]:
     """Assign each maximum of the smoothed frame to the nearest lit BP: smoothing may merge several highlights."""
-    owners: dict[Pixel, HighlightPoint] = {}
-    for point, peak in zip(points, peaks, strict=True):
-        if not point.lit:
-            continue
-        centre = np.array([peak[1] + PIXEL_CENTRE, peak[0] + PIXEL_CENTRE])
-        rival = owners.setdefault(peak, point)
-        if np.hypot(*(point.bp_px - centre)) < np.hypot(*(rival.bp_px - centre)):
-            owners[peak] = point
-    return owners
+    gaps = np.reshape([point.bp_px for point in points], (-1, 2)) - np.reshape(peaks, (-1, 2))[:, ::-1] - PIXEL_CENTRE
+    away = np.hypot(*gaps.T).tolist()
+    owners: dict[Pixel, int] = {}
+    for i, (point, peak) in enumerate(zip(points, peaks, strict=True)):
+        if point.lit and away[i] < away[owners.setdefault(peak, i)]:
+            owners[peak] = i
+    return {peak: points[i] for peak, i in owners.items()}
 
 
 def _examined(
-    point: HighlightPoint, smoothed: Image, seen: Mask | None, peak: Pixel, owns_peak: bool, others: IntArray
+    point: HighlightPoint, smoothed: Image, seen: Mask | None, peak: Pixel, owns_peak: bool, lit: IntArray
 ) -> Examined:
     """Examine a highlight point, whose maximum is at a peak, by all conditions but that of noise.
 
-    `others` are columns and rows, shape (N, 2), of the points that may not lie in its half-height region.
+    `lit` are columns and rows, shape (N, 2), of the points of which only itself may lie in its half-height region.
     """
     level = float(smoothed[peak])
     if not point.lit:
@@ -303,7 +299,7 @@ def _examined(
         return Examined(peak, level, None, "part of a brighter one")
     # Shape, frame, noise: in the order of theory.md section 6.
     why_not = ""
-    if component.holds(others).any():
+    if np.count_nonzero(component.holds(lit)) > 1:
         why_not = SEVERAL
     elif point.min_gain <= HIGHLIGHT_MIN_GAIN:
         why_not = STREAK
@@ -312,17 +308,21 @@ def _examined(
     return Examined(peak, level, contrast(smoothed, component, level, seen), why_not, component)
 
 
-def _peak_pixel(smoothed: Image, point: HighlightPoint) -> Pixel:
-    """Climb from the true BP to the local maximum."""
-    column, row = (int(v) for v in point.bp_px)
-    row, column = min(row, smoothed.shape[0] - 1), min(column, smoothed.shape[1] - 1)
-    while True:
-        top, left = max(row - 1, 0), max(column - 1, 0)
-        window = smoothed[top : row + 2, left : column + 2]
-        step = divmod(int(window.argmax()), window.shape[1])
-        if (step[0] + top, step[1] + left) == (row, column):
-            return row, column
-        row, column = step[0] + top, step[1] + left
+def _peak_pixels(smoothed: Image, points: Sequence[HighlightPoint]) -> list[Pixel]:
+    """Climb from each true BP to its local maximum."""
+    last = np.array(smoothed.shape) - 1
+    places = np.minimum(np.array([point.bp_px for point in points]).reshape(-1, 2)[:, ::-1].astype(int), last)
+    around = np.stack(np.divmod(np.arange(9), 3), axis=1) - 1
+    climbing = np.arange(len(places))
+    while len(climbing):
+        # At the border the window holds some pixels twice, of which the first counts.
+        windows = np.clip(places[climbing, None] + around, 0, last)
+        steps = smoothed[windows[..., 0], windows[..., 1]].argmax(axis=1)
+        reached = windows[np.arange(len(steps)), steps]
+        moved = (reached != places[climbing]).any(axis=1)
+        places[climbing] = reached
+        climbing = climbing[moved]
+    return [(row, column) for row, column in places.tolist()]
 
 
 @dataclass(frozen=True)

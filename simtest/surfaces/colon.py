@@ -37,7 +37,7 @@ QUARTERED = 0.3
 LEAST_FACING = 0.7
 """On a pedunculated polyp, triangles are cut if the cosine between their normal and a corner's is smaller."""
 
-_SPLITS = 6
+_SPLITS, _BLOCK = 6, 2**14
 MAX_TRIANGLES = 5_000_000
 
 
@@ -61,7 +61,9 @@ class Colon(MeshedSurface):
         """Return S by the tube's formulas (see `SurfaceModel.vertex_shape_operators`)."""
         parameters = np.empty((len(self.mesh.vertices), 2))
         parameters[self.mesh.faces.ravel()] = self.corners.reshape(-1, 2)
-        return self.form(*parameters.T)[1]
+        # In blocks: the temporaries of a whole mesh are many times as large.
+        blocks = np.split(parameters, range(_BLOCK, len(parameters), _BLOCK))
+        return np.concatenate([self.form(*block.T)[1] for block in blocks])
 
     def clearance(self, points: Array) -> Array:
         """Return the signed distance to the wall, mm; positive in the lumen (see `SurfaceModel.clearance`).

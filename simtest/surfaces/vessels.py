@@ -33,7 +33,7 @@ PRIMES = (73856093, 19349663, 83492791)
 LOAD = 0.5
 """Entries of lists over slots, at most: then few cells share a slot."""
 
-SEGMENTS = 2**15
+SEGMENTS = 2**12
 """Segments that are sorted together: they bound the memory."""
 
 MARGIN_MM = 0.02
@@ -60,10 +60,11 @@ class SegmentTable:
     """Segments by the cell in which they are seen."""
 
     cell_mm: float  # Side of a cell
-    # (slots + 1,): where each slot's list starts in `rows`; the number of slots is a power of two
+    # (slots + 1,): where each slot's list starts in `listed`; the number of slots is a power of two
     first: npt.NDArray[np.uint32]
-    # (R, 8): segments of the lists: start (3), half-width that is seen, end minus start (3), peak of the chord, mm;
-    # the last is negative for a vein
+    listed: npt.NDArray[np.uint32]  # (R,): the segments of the lists, by their number
+    # (S, 8): of each segment start (3), half-width that is seen, end minus start (3), peak of the chord, mm; the last
+    # is negative for a vein
     rows: npt.NDArray[np.float32]
     # (3,): along each axis of the model, how far from its origin the segments reach; beyond, they are mirrored over
     # and over. `ENDLESS` where they are not
@@ -96,7 +97,7 @@ class SegmentTable:
         active = np.flatnonzero(last > first)
         row = first.astype(np.int64)
         while len(active):
-            rows = self.rows[row[active]].astype(np.float64)
+            rows = self.rows[self.listed[row[active]]].astype(np.float64)
             chord, vein = _chord(points[active], rows)
             longest[active, vein] = np.maximum(longest[active, vein], chord)
             weight[active, vein] += chord
@@ -106,7 +107,9 @@ class SegmentTable:
         return longest, deep / np.maximum(weight, LEAST_CHORD)
 
 
-NO_VESSELS = SegmentTable(1.0, np.zeros(3, dtype=np.uint32), np.zeros((1, 8), dtype=np.float32))
+NO_VESSELS = SegmentTable(
+    1.0, np.zeros(3, dtype=np.uint32), np.zeros(1, dtype=np.uint32), np.zeros((1, 8), dtype=np.float32)
+)
 """The table of a surface without vessels."""
 
 
@@ -149,18 +152,22 @@ def make_table(segments: "VesselSegments", depth_mm: Array | float, half_mm: Arr
     parts = [
         _cells(segments, width, cell_mm, slice(start, start + SEGMENTS)) for start in range(0, len(width), SEGMENTS)
     ]
-    owner, cell = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    owner, hashed = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     slots = 1 << max(1, math.ceil(math.log2(len(owner) / LOAD)))
-    slot = _hash(cell) & (slots - 1)
+    slot = hashed & np.uint32(slots - 1)
     first = np.zeros(slots + 1, dtype=np.uint32)
-    first[1:] = np.cumsum(np.bincount(slot, minlength=slots))
+    np.cumsum(np.bincount(slot, minlength=slots), out=first[1:], dtype=np.uint32)
+    # A stable order by a sort of whole numbers, in place, which takes the least time and memory
+    order = slot.astype(np.int64) * len(slot)
+    order += np.arange(len(slot))
+    order.sort()
+    order %= len(slot)
     rows = np.column_stack([segments.start, width, segments.end - segments.start, np.where(segments.vein, -peak, peak)])
-    sorted_rows = rows.astype(np.float32)[owner[np.argsort(slot, kind="stable")]]
-    return SegmentTable(cell_mm, first, sorted_rows, half_mm)
+    return SegmentTable(cell_mm, first, owner[order].astype(np.uint32), rows.astype(np.float32), half_mm)
 
 
 def _cells(segments: "VesselSegments", width: Array, cell_mm: float, some: slice) -> tuple[IntArray, IntArray]:
-    """Return pairs of some segment and a cell, shapes (P,) and (P, 3), in which it is seen on the surface."""
+    """Return some segment and the hash of a cell in which it is seen on the surface, of each pair of such."""
     # Lengths are in cells, in single precision: `MARGIN_MM` covers its rounding.
     start, end = segments.start[some] / cell_mm, segments.end[some] / cell_mm
     reach = ((width[some] + MARGIN_MM) / cell_mm)[:, None]
@@ -190,7 +197,7 @@ def _cells(segments: "VesselSegments", width: Array, cell_mm: float, some: slice
     reached = nearest < ((reach[:, 0] + np.linalg.norm(along, axis=1) / (2 * STEPS)) ** 2)[owner]
     owner, kept = owner[reached], kept[reached]
     cell = low[owner] + np.stack([step[kept] for step in steps], axis=1)
-    return owner.astype(np.int64) + some.start, cell.astype(np.int64)
+    return owner + np.int32(some.start), _hash(cell.astype(np.int64)).astype(np.uint32)
 
 
 def _hash(cell: IntArray) -> IntArray:
