@@ -67,6 +67,9 @@ TILE_PX, VARIES = 4, 0.3
 """Pixels along the side of the tiles that are divided: those in which no component of the misfit is farther from 0 than
 this share of its range over the tile and the pixels round it."""
 
+CACHED = 2**16
+"""Cells among which seeds are looked for together, so that the processor's cache holds them."""
+
 MAX_DIVISION = 8
 LEAST_WAVE_PX = 1.5
 """Pixels are divided by at most this. Relief whose waves are shorter than this many px is not resolved there, and acts
@@ -183,6 +186,16 @@ def grid_seeds(w: Image, first: IntArray, least_slope: float = 0.0) -> Array:
     The misfit is of shape (2, T, h, w); `first` are columns and rows, shape (T, 2), of the grids' first cells. Seeds
     are dropped where the misfit's slope along some direction is less than `least_slope` per cell.
     """
+    blocks = range(0, len(first), max(1, CACHED // math.prod(w.shape[2:])))
+    parts = [_candidates(w[:, at : at + blocks.step], first[at : at + blocks.step], least_slope) for at in blocks]
+    seeds, is_stepped = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    # Row by row, whatever the grids; cells that hold a zero come before those near one.
+    order = np.lexsort((*seeds.T, is_stepped))
+    return seeds[order][first_of_each(seeds[order], SAME_SEED)]
+
+
+def _candidates(w: Image, first: IntArray, least_slope: float) -> tuple[Array, Mask]:
+    """Return the seeds of some grids, in any order and as often as they are found, and which are stepped to."""
     # Newton steps from central differences.
     inner = w[..., 1:-1, 1:-1]
     along_x = (w[..., 1:-1, 2:] - w[..., 1:-1, :-2]) / 2
@@ -206,9 +219,7 @@ def grid_seeds(w: Image, first: IntArray, least_slope: float = 0.0) -> Array:
         with np.errstate(divide="ignore", invalid="ignore"):
             steep = area * np.sqrt(2 / (squares + np.sqrt(np.maximum(squares**2 - 4 * area**2, 0)))) > least_slope
         seeds, is_stepped = seeds[steep], is_stepped[steep]
-    # Row by row, whatever the grids; cells that hold a zero come before those near one.
-    order = np.lexsort((*seeds.T, is_stepped))
-    return seeds[order][first_of_each(seeds[order], SAME_SEED)]
+    return seeds, is_stepped
 
 
 def _thin_parts(distance: Image) -> IntArray:
@@ -255,9 +266,9 @@ def refine(session: "Session", seeds: Array, lights: IntArray, fine: bool) -> tu
 
 def first_of_each(points: Array, apart: float, owners: IntArray | None = None) -> Mask:
     """Return which points, shape (N, 2), have no earlier one that stays, of the same owner, within a distance."""
-    kept = np.ones(len(points), dtype=bool)
+    kept = [True] * len(points)
     if len(points) < 2:
-        return kept
+        return np.array(kept, dtype=bool)
     from scipy.spatial import cKDTree
 
     # Owners are a coordinate along which they are farther apart.
@@ -266,7 +277,7 @@ def first_of_each(points: Array, apart: float, owners: IntArray | None = None) -
     for i, j in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].tolist():
         if kept[i]:
             kept[j] = False
-    return kept
+    return np.array(kept)
 
 
 def describe(session: "Session", pixels: Array, lights: IntArray, fine: bool) -> list[HighlightPoint]:

@@ -84,7 +84,9 @@ def _record(highlight: object, names: Sequence[str]) -> dict[str, Json]:
     record: dict[str, Json] = {}
     for name in names:
         value = getattr(highlight, name)
-        if isinstance(value, (np.ndarray, tuple)):
+        if isinstance(value, np.ndarray):
+            value = value.tolist()
+        elif isinstance(value, tuple):
             value = np.asarray(value).tolist()
         elif value == "" or (isinstance(value, float) and not math.isfinite(value)):
             value = None
