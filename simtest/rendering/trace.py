@@ -196,7 +196,8 @@ class Tracer:
     def _maps(self, rows: list[list[Image]]) -> list[Image]:
         """Make maps, shape (H, W), of the channels of launches, row after row."""
         shape = (self.sightlines.camera.height, self.sightlines.camera.width)
-        return [np.concatenate(pieces).reshape(shape) for pieces in zip(*rows, strict=True)]
+        whole = rows[0] if len(rows) == 1 else [np.concatenate(pieces) for pieces in zip(*rows, strict=True)]
+        return [channel.reshape(shape) for channel in whole]
 
     # Several samples ---------------------------------------------------------------------------------------------
 
@@ -298,7 +299,8 @@ def evaluate(values: list[Any], count: int) -> list[Image]:
     """Compute all channels in one kernel; a constant one is broadcast."""
     # Together: evaluated one by one, each would trace the rays again.
     dr.eval(values)
-    return [np.broadcast_to(np.array(value, dtype=np.float32), (count,)) for value in values]
+    arrays = [np.array(value, dtype=np.float32) for value in values]
+    return [array if array.shape == (count,) else np.full(count, array) for array in arrays]
 
 
 def as_radiance(parts: list[Image]) -> Radiance:

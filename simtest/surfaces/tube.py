@@ -509,7 +509,9 @@ class Tube:
             s, c = np.sin(psi), np.cos(psi)
             x, z = (points - self.centreline(u))[:, [0, 2]].T
             slope = np.maximum(1 - bend * (x * c - z * s), 0.1)  # the tube keeps it positive
-            u = u + np.clip((x * s + z * c) / slope, -5.0, 5.0)
+            before, u = u, u + np.clip((x * s + z * c) / slope, -5.0, 5.0)
+            if np.array_equal(before, u):
+                break
         # angle and distance in the slice
         psi = self.heading(u)[0]
         x, y, z = (points - self.centreline(u)).T
