@@ -1,7 +1,8 @@
 """Camera poses by number, and along a path through a lumen; never in tissue.
 
-The same label and number give the same pose. For a path the inside of the lumen is sampled on a grid; it joins the two
-cells that are farthest apart, by the route that keeps farthest from the wall, and is then smoothed.
+The same label and number give the same pose. A path follows the centreline of a closed tube. In another lumen the inside
+is sampled on a grid; the path joins the two cells that are farthest apart, by the route that keeps farthest from the
+wall, and is then smoothed.
 """
 
 import math
@@ -18,8 +19,10 @@ from simtest.geometry.vectors import tangent_basis, unit
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.seeds import Stage, generator
 from simtest.spec.surfaces import AnatomySurface
+from simtest.surfaces.colon import Colon
 from simtest.surfaces.model import SurfaceModel, TriangleMesh, remembered
 from simtest.surfaces.triangles import MIN_CLEARANCE_MM, MeshedSurface, MeshProbe
+from simtest.surfaces.tube import Tube
 
 CLEARANCE_SHARE = 0.6
 """In a narrower lumen: share of the largest clearance found."""
@@ -161,9 +164,17 @@ class CameraPath:
 
 def camera_path(surface: SurfaceModel) -> CameraPath:
     """Find the camera path through the mesh of a lumen, closed or open at its ends; the last few are cached."""
+    if isinstance(surface, Colon) and surface.tube.recipe.closed:
+        return _along_centreline(surface.tube, surface.probe)
     mesh = surface.shape().mesh
     assert mesh is not None
     return _camera_path(mesh)
+
+
+@remembered
+def _along_centreline(tube: Tube, probe: MeshProbe) -> CameraPath:
+    along = np.arange(-tube.depth, tube.recipe.length_mm + tube.depth, STEP_MM)
+    return _clear_of_wall(tube.centreline(along), probe)
 
 
 @remembered
@@ -178,7 +189,11 @@ def _camera_path(mesh: TriangleMesh) -> CameraPath:
     # route and smooth path
     room = probe.distance(centres)
     rough = centres[_roomiest_route(cells, room)]
-    path = _resampled(rough, pitch)
+    return _clear_of_wall(_resampled(rough, pitch), probe)
+
+
+def _clear_of_wall(path: Array, probe: MeshProbe) -> CameraPath:
+    """Return the part of an evenly spaced path that is clear of the wall."""
     path = _without_ends(path, probe.distance(path))
     length = STEP_MM * (len(path) - 1)
     if length < MIN_LENGTH_MM:

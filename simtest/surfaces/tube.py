@@ -32,6 +32,7 @@ are the identity to rounding. On the polyp the surface is no radius over the cen
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -56,6 +57,9 @@ LIFT_REACH = 2.0
 
 FAR = 40.0
 """With an exponent beyond this an exponential is below rounding."""
+
+NOTHING = 750.0
+"""With an exponent beyond this it is 0."""
 
 _STEPS = 80
 _PROFILE = np.linspace(0.01, 0.9999, 4000)
@@ -220,6 +224,9 @@ POLYP_STEEPNESS = (3.0, 10.0)
 POLYP_EDGE = 0.1
 """A polyp is seen where it raises the wall by this share of its height."""
 
+_BLOCK, _MANY = 8192, 256
+"""Points of a block, which the processor's cache holds; with fewer a fold, all its folds are computed at once."""
+
 _PANEL_DEGREE = 12
 """Of the polynomials that stand for the centreline between two knots: exact to rounding for every bend allowed."""
 
@@ -277,11 +284,12 @@ class Tube:
         # Stage.SWEEP: the shape is part of the case, not of a realisation's rendering or noise.
         rng = generator(recipe.seed, "anatomy", "colon", 0, Stage.SWEEP)
         self._phase, self._taenia_phase = rng.uniform(0, 2 * math.pi, size=2)
-        self._folds = (*self._draw_folds(rng), *self._ridges(), *self._draw_creases())
+        self._folds: tuple[_Fold, ...] = ()
+        self._add((*self._draw_folds(rng), *self._ridges(), *self._draw_creases()))
         self._relief = self._draw_relief(rng)
         self.polyps = (*recipe.polyps, *self._draw_polyps())
         self._sessile = dict(self._bumps())
-        self._folds += tuple(self._sessile.values())
+        self._add(tuple(self._sessile.values()))
         self.depth = recipe.radius_mm if recipe.closed else 0.0  # of each end, mm
         # u of the ends, short of the poles, where no tangent leads around, and of the last solutions
         arc, slack = (math.pi / 2 * self.depth - _POLE_MM, _POLE_MM) if recipe.closed else (0.0, _END_MM)
@@ -297,6 +305,17 @@ class Tube:
         self._stalks: dict[int, Stalk] = {}
         self._check()
         self._stalks = dict(self._draw_stalks())
+
+    def _add(self, folds: tuple[_Fold, ...]) -> None:
+        """Add folds, with a table of their numbers and of how far each reaches: to where it is 0, or below rounding."""
+        self._folds += folds
+        far = FAR if self.recipe.closed else NOTHING
+        rows = [
+            (f.along, math.sin(f.centre), math.cos(f.centre), f.depth, f.width**2, f.slant, f.kappa, f.steep)
+            for f in self._folds
+        ]
+        self._table = np.ascontiguousarray(np.transpose(rows))
+        self._reach = np.abs(self._table[5]) + np.sqrt(2 * far * self._table[4])
 
     def _draw_folds(self, rng: np.random.Generator) -> tuple[_Fold, ...]:
         recipe, spread, folds = self.recipe, self.recipe.irregularity, []
@@ -499,40 +518,33 @@ class Tube:
 
     def radius(self, u: Array, v: Array, second: bool = True) -> Jet:
         """Return r(u, v), mm, and its derivatives, without `second` only the first; u, v of shape (N,)."""
+        order = np.argsort(u)
+        u, v = u[order], v[order]
         # taeniae
         amplitude, angle = self.recipe.taenia_mm, 3 * (v - self._taenia_phase)
         sine, cosine = np.sin(angle), np.cos(angle)
         zero = np.zeros_like(u)
         f, fu, fv = self.recipe.radius_mm + amplitude * cosine, zero.copy(), -3 * amplitude * sine
         fuu, fuv, fvv = zero.copy(), zero.copy(), -9 * amplitude * cosine
-        # folds and sessile polyps
-        sine_v, cosine_v = np.sin(v), np.cos(v)
-        for fold in self._folds:
-            # Of v - centre, without a sine of each point for each fold
-            sine_c, cosine_c = math.sin(fold.centre), math.cos(fold.centre)
-            sine, cosine = sine_v * cosine_c - cosine_v * sine_c, cosine_v * cosine_c + sine_v * sine_c
-            x, w2 = u - fold.along - fold.slant * sine, fold.width**2
-            exponent = -(x**2) / (2 * w2) + fold.kappa * (cosine - 1)
-            # Derivatives of the exponent E; x_v = -slant cos.
-            eu, ev = -x / w2, x * fold.slant * cosine / w2 - fold.kappa * sine
-            if fold.steep:
-                turn, a, b = 1 - 2 * fold.steep * exponent, eu, ev
-                exponent, eu, ev = exponent - fold.steep * exponent**2, turn * a, turn * b
-            bump = fold.depth * np.exp(exponent)
-            f -= bump
-            fu -= bump * eu
-            fv -= bump * ev
-            if not second:
-                continue
-            euu: Array | float = -1 / w2
-            euv = fold.slant * cosine / w2
-            evv = -((fold.slant * cosine) ** 2 + x * fold.slant * sine) / w2 - fold.kappa * cosine
-            if fold.steep:
-                twice = 2 * fold.steep
-                euu, euv, evv = turn * euu - twice * a**2, turn * euv - twice * a * b, turn * evv - twice * b**2
-            fuu -= bump * (eu * eu + euu)
-            fuv -= bump * (eu * ev + euv)
-            fvv -= bump * (ev * ev + evv)
+        # folds and sessile polyps: block by block one after the other, or, of a few points, all at once
+        parts, sine_v, cosine_v = (f, fu, fv, fuu, fuv, fvv), np.sin(v), np.cos(v)
+        for start in range(0, len(u), _BLOCK):
+            block = slice(start, start + _BLOCK)
+            first = np.searchsorted(u[block], self._table[0] - self._reach)
+            counts = np.searchsorted(u[block], self._table[0] + self._reach, side="right") - first
+            each = np.flatnonzero(counts)
+            if counts.sum() < _MANY * len(each):
+                at = np.arange(counts.sum()) + np.repeat(first - np.cumsum(counts) + counts, counts)
+                groups: list[Any] = [(at, np.repeat(self._table, counts, axis=1))]
+            else:
+                groups = [(slice(first[n], first[n] + counts[n]), self._table[:, n]) for n in each]
+            for at, fold in groups:
+                bumps = _bumps(fold, u[block][at], sine_v[block][at], cosine_v[block][at], second)
+                for part, bump in zip(parts, bumps, strict=False):
+                    if isinstance(at, slice):
+                        part[block][at] -= bump
+                    else:
+                        np.subtract.at(part[block], at, bump)
         # relief
         for q, m, phase in self._relief:
             angle = q * u + m * v + phase
@@ -545,8 +557,11 @@ class Tube:
             fuu -= q * q * cosine
             fuv -= q * m * cosine
             fvv -= m * m * cosine
-        hessian = [np.stack([fuu, fuv, fuv, fvv], axis=1).reshape(-1, 2, 2)] if second else []
-        return Jet(f, np.stack([fu, fv], axis=1), *hessian)
+        # in the order of the points
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        hessian = [np.stack([fuu, fuv, fuv, fvv], axis=1)[back].reshape(-1, 2, 2)] if second else []
+        return Jet(f[back], np.stack([fu, fv], axis=1)[back], *hessian)
 
     def numbers(self) -> TubeNumbers:
         """Return the tube as numbers, without its pedunculated polyps."""
@@ -690,6 +705,31 @@ class Tube:
                 break
         inside = (u >= self.bounds[0]) & (u <= self.bounds[1])
         return np.where(solved & inside, t, np.nan), u, v
+
+
+def _bumps(fold: Array, u: Array, sine_v: Array, cosine_v: Array, second: bool) -> list[Array]:
+    """Return a fold at points, and its derivatives; by a column of `Tube._table`, or one for each point."""
+    along, sine_c, cosine_c, depth, w2, slant, kappa, steep = fold
+    # Of v - centre, without a sine of each point for each fold
+    sine, cosine = sine_v * cosine_c - cosine_v * sine_c, cosine_v * cosine_c + sine_v * sine_c
+    x = u - along - slant * sine
+    exponent = -(x**2) / (2 * w2) + kappa * (cosine - 1)
+    # Derivatives of the exponent E; x_v = -slant cos.
+    eu, ev = -x / w2, x * slant * cosine / w2 - kappa * sine
+    steeper = steep.any()
+    if steeper:
+        turn, a, b = 1 - 2 * steep * exponent, eu, ev
+        exponent, eu, ev = exponent - steep * exponent**2, turn * a, turn * b
+    bump = depth * np.exp(exponent)
+    bumps = [bump, bump * eu, bump * ev]
+    if second:
+        euu, euv = -1 / w2, slant * cosine / w2
+        evv = -((slant * cosine) ** 2 + x * slant * sine) / w2 - kappa * cosine
+        if steeper:
+            twice = 2 * steep
+            euu, euv, evv = turn * euu - twice * a**2, turn * euv - twice * a * b, turn * evv - twice * b**2
+        bumps += [bump * (eu * eu + euu), bump * (eu * ev + euv), bump * (ev * ev + evv)]
+    return bumps
 
 
 def _dot(a: Array, b: Array) -> Array:
