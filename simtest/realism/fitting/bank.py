@@ -34,7 +34,7 @@ KNOWN: tuple[tuple[str, str, str], ...] = (
     ("film patches", r"reflectance\.film\.patches\.(wavelength_mm|amplitude|dry_level)", ""),
     ("colour of the tissue", r"reflectance\.albedo\.(base\.\d|blood)", ""),
     ("texture contrast", r"reflectance\.albedo\.(mottling\.amplitude|vessels\.strength|capillaries\.strength)", ""),
-    ("exposure", r"sensor\.exposure\.(average|percentile|gain|full_scale)", ""),
+    ("exposure", r"sensor\.exposure\.(average|centre|percentile|gain|full_scale)", ""),
     ("vignetting", r"sensor\.vignetting\.power", ""),
     ("profile of the light", r"rig\.(each|lights\.\d+)\.profile\.power", ""),
     ("source size", r"rig\.(each|lights\.\d+)\.source\.radius_mm", "mm"),
