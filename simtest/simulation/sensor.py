@@ -155,7 +155,7 @@ def capture(
 
 
 def encode(frame: Image, sensor: Sensor, seen: Mask | None = None) -> Image:
-    """Turn a linear frame into the picture: clip, apply the response, denoise, sharpen, weave, scale, draw, quantise, code it.
+    """Turn a linear frame into the picture: clip it, apply the response, then the stages behind it in their order.
 
     `seen`, shape (H, W), are the pixels inside the camera's view mask, default all.
     """
@@ -371,8 +371,8 @@ def luma(picture: Image) -> Image:
 def denoise(picture: Image, denoising: Denoising) -> Image:
     """Return an encoded picture without the noise that is small beside `level`; it reaches as far as 2 deviations."""
     diameter = 2 * math.ceil(2 * denoising.radius_px) + 1
-    filtered = cv2.bilateralFilter(picture, diameter, denoising.level, denoising.radius_px, None, cv2.BORDER_REFLECT_101)
-    return np.asarray(filtered)
+    widths = denoising.level, denoising.radius_px
+    return np.asarray(cv2.bilateralFilter(picture, diameter, *widths, borderType=cv2.BORDER_REFLECT_101))
 
 
 def sharpen(picture: Image, sharpening: Sharpening) -> Image:

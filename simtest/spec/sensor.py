@@ -309,7 +309,8 @@ class Sensor(Spec):
     """From radiance to a frame, in this order.
 
     Point spread, vignetting, colour fringe, exposure, colour filter mosaic, noise, demosaicing, white balance and
-    colour matrix, saturation, response, noise reduction, sharpening, interlacing and scaling, captions, quantisation, coding.
+    colour matrix, saturation, response, noise reduction, sharpening, interlacing and scaling, captions, quantisation,
+    coding.
     """
 
     preset: SensorPreset | None = Field(
