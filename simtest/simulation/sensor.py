@@ -25,6 +25,7 @@ from simtest.spec.sensor import (
     Caption,
     Coding,
     ColourProcessing,
+    Denoising,
     H264Coding,
     Inset,
     Interlacing,
@@ -154,7 +155,7 @@ def capture(
 
 
 def encode(frame: Image, sensor: Sensor, seen: Mask | None = None) -> Image:
-    """Turn a linear frame into the picture: clip, apply the response, sharpen, weave, scale, draw, quantise, code it.
+    """Turn a linear frame into the picture: clip it, apply the response, then the stages behind it in their order.
 
     `seen`, shape (H, W), are the pixels inside the camera's view mask, default all.
     """
@@ -162,6 +163,8 @@ def encode(frame: Image, sensor: Sensor, seen: Mask | None = None) -> Image:
     if not sensor.is_processed:
         return _quantised(response.encode(linear), sensor.bits)
     picture = response.encode_picture(linear)
+    if sensor.denoising is not None:
+        picture = denoise(picture, sensor.denoising)
     if sensor.sharpening is not None:
         picture = sharpen(picture, sensor.sharpening)
         picture = np.clip(picture, 0.0, 1.0) if sensor.clips else picture
@@ -363,6 +366,13 @@ def _mix(frame: Image, matrix: Array) -> Image:
 def luma(picture: Image) -> Image:
     """Return the luma of an encoded picture, shape (H, W)."""
     return picture if picture.ndim == 2 else np.asarray(cv2.transform(picture, LUMA[None]))
+
+
+def denoise(picture: Image, denoising: Denoising) -> Image:
+    """Return an encoded picture without the noise that is small beside `level`; it reaches as far as 2 deviations."""
+    diameter = 2 * math.ceil(2 * denoising.radius_px) + 1
+    widths = denoising.level, denoising.radius_px
+    return np.asarray(cv2.bilateralFilter(picture, diameter, *widths, borderType=cv2.BORDER_REFLECT_101))
 
 
 def sharpen(picture: Image, sharpening: Sharpening) -> Image:

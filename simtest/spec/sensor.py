@@ -117,6 +117,18 @@ class Fringe(Spec):
     blue: float = Field(-0.002, ge=-0.01, le=0.01, description="the same of blue")
 
 
+class Denoising(Spec):
+    """Noise reduction before sharpening: OpenCV's bilateral filter of the encoded picture (Tomasi and Manduchi 1998).
+
+    Its weights fall as Gaussians of the distance and of the difference in colour, so that edges stay.
+    """
+
+    radius_px: float = Field(1.5, ge=0.3, le=5, description="standard deviation of the Gaussian of the distance, px")
+    level: float = Field(
+        0.05, gt=0, le=1, description="that of the colour's difference, summed over the channels, encoded"
+    )
+
+
 class Sharpening(Spec):
     """Unsharp masking of the encoded picture's luma: value + amount (value - value smoothed by a Gaussian).
 
@@ -297,7 +309,8 @@ class Sensor(Spec):
     """From radiance to a frame, in this order.
 
     Point spread, vignetting, colour fringe, exposure, colour filter mosaic, noise, demosaicing, white balance and
-    colour matrix, saturation, response, sharpening, interlacing and scaling, captions, quantisation, coding.
+    colour matrix, saturation, response, noise reduction, sharpening, interlacing and scaling, captions, quantisation,
+    coding.
     """
 
     preset: SensorPreset | None = Field(
@@ -325,6 +338,7 @@ class Sensor(Spec):
     mosaic: Mosaic | None = Field(None, description="default: each pixel measures all colours")
     colour: ColourProcessing | None = Field(None, description="default: the sensor's colours are the picture's")
     fringe: Fringe | None = Field(None, description="colour fringe; default none", **UNSAID)
+    denoising: Denoising | None = Field(None, description="noise reduction; default none", **UNSAID)
     sharpening: Sharpening | None = Field(None, description="default none")
     interlacing: Interlacing | None = Field(None, description="default none", **UNSAID)
     scaling: Scaling | None = Field(None, description="default: recorded at the camera's size")
@@ -371,7 +385,7 @@ class Sensor(Spec):
     @property
     def is_processed(self) -> bool:
         """Whether the picture goes through stages behind the response, which change neighbouring pixels."""
-        return any((self.sharpening, self.interlacing, self.scaling, self.overlay, self.coding))
+        return any((self.denoising, self.sharpening, self.interlacing, self.scaling, self.overlay, self.coding))
 
     @property
     def encodes(self) -> bool:

@@ -241,7 +241,8 @@ def make_relief(spec: Relief, level: float | None = None, patches: Patches | Non
         return field
     # A relief of its own, of any slope: it is scaled to the deviation.
     seed = int(np.random.SeedSequence(spec.seed, spawn_key=(PATCH_BRANCH,)).generate_state(1)[0])
-    waves = ReliefBand(slope_deg=1.0, wavelength_mm=patches.wavelength_mm, width=PATCH_WIDTH)
+    slope = min(1.0, 15.0 / patches.wavelength_mm)  # long waves of 1 deg would be higher than a relief may be
+    waves = ReliefBand(slope_deg=slope, wavelength_mm=patches.wavelength_mm, width=PATCH_WIDTH)
     own = _make_field(Relief(bands=(waves,), seed=seed))
     scale = patches.amplitude * field.deviation / own.deviation
     return replace(

@@ -131,6 +131,7 @@ def _sensor(scene: Scene) -> str:
             ("lossy coding", sensor.coding is not None),
             ("colour mosaic", sensor.mosaic is not None),
             ("colour processing", sensor.colour is not None),
+            ("noise reduction", sensor.denoising is not None),
             ("sharpening", sensor.sharpening is not None),
             ("rescaled", sensor.scaling is not None),
             ("overlay", sensor.overlay is not None),
@@ -304,7 +305,7 @@ def _spot(rows: pl.DataFrame, told: Mapping[str, object]) -> str:
 
 MEASURED = Path(__file__).parent / "measured_realism.json"
 
-CHAIN = ("fringe", "mosaic", "colour", "sharpening", "interlacing", "scaling", "overlay", "coding")
+CHAIN = ("fringe", "mosaic", "colour", "denoising", "sharpening", "interlacing", "scaling", "overlay", "coding")
 """Stages of the camera chain, keys of `sensor`: with one of them, or with motion, there is a chain."""
 
 UNKNOWN = "Its distance to real frames is not known; `simtest realism` measures it."

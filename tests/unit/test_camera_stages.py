@@ -22,6 +22,7 @@ from simtest.spec.sensor import (
     PRESETS,
     Box,
     Caption,
+    Denoising,
     H264Coding,
     Interlacing,
     JpegCoding,
@@ -224,6 +225,35 @@ def test_a_highlight_of_a_tinted_sensor_is_white():
 
 
 # Detail ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(30, 40), (30, 40, 3)])
+def test_denoising_is_the_bilateral_filter(shape):
+    frame, spec = picture(shape, smooth=1.0), Denoising(radius_px=0.9, level=0.2)
+    found = camera_chain.denoise(frame, spec)
+    # Summed as Tomasi and Manduchi have it, over a disc of the filter's reach.
+    colour = frame.reshape(*frame.shape[:2], -1).astype(float)
+    around = np.pad(colour, ((2, 2), (2, 2), (0, 0)), mode="reflect")
+    total, weights = np.zeros_like(colour), np.zeros((*frame.shape[:2], 1))
+    for row, column in itertools.product(range(-2, 3), repeat=2):
+        if (away := row**2 + column**2) <= 4:
+            other = around[2 + row : 32 + row, 2 + column : 42 + column]
+            apart = np.abs(other - colour).sum(axis=-1, keepdims=True)
+            weight = np.exp(-away / (2 * 0.9**2) - apart**2 / (2 * 0.2**2))
+            total, weights = total + weight * other, weights + weight
+    np.testing.assert_allclose(found.reshape(colour.shape), total / weights, atol=2e-4)
+
+
+def test_denoising_takes_noise_and_leaves_edges():
+    steps = np.where(np.arange(64) < 32, 0.3, 0.8)[None, :, None] * np.ones((64, 1, 3))
+    noisy = (steps + 0.01 * np.random.default_rng(3).standard_normal(steps.shape)).astype(np.float32)
+    found = camera_chain.capture(noisy, 1.0, sensor(denoising={"level": 0.1}), None)
+    assert np.std(found - steps) < 0.4 * np.std(noisy - steps)
+    assert np.abs(found - steps).max() < np.abs(noisy - steps).max()
+    # Uncertainty is told of the noise that is left.
+    keys, at = {"full_well": 2000, "response": {"type": "srgb"}}, (np.array([20]), np.array([12]), 16)
+    plain, reduced = (noise_at(noisy, 1.0, sensor(**keys, **more), *at) for more in ({}, {"denoising": {"level": 0.3}}))
+    assert reduced < 0.5 * plain
 
 
 def test_sharpening_equals_direct_convolution():
@@ -528,7 +558,8 @@ def test_stages_come_in_physical_order():
     """The whole chain equals its stages called one by one, in the order of the sensor's docstring."""
     told = sensor(mosaic={}, colour=WARM, full_well=4000, read_noise=3.0, noise_sigma=0.005, response={"type": "srgb"},
                   sharpening={}, scaling={"factor": 0.7}, overlay={"captions": [{"text": "A"}]}, bits=8,
-                  coding={"type": "jpeg", "quality": 80}, fringe={}, interlacing={"shift_px": [3, 0]})  # fmt: skip
+                  coding={"type": "jpeg", "quality": 80}, fringe={}, denoising={},
+                  interlacing={"shift_px": [3, 0]})  # fmt: skip
     light = (4 * picture((64, 96, 3))).astype(np.float32)
     found = camera_chain.capture(light, 2.0, told, np.random.default_rng(7))
     # One by one.
@@ -541,6 +572,7 @@ def test_stages_come_in_physical_order():
     plane = plane + np.float32(0.005) * rng.standard_normal(plane.shape, dtype=np.float32)
     linear = camera_chain.develop(camera_chain.demosaic(plane, told.mosaic), told.colour, True)
     values = told.response.model().encode_picture(np.clip(linear, 0, 1))
+    values = camera_chain.denoise(values, told.denoising)
     values = np.clip(camera_chain.sharpen(values, told.sharpening), 0, 1)
     values = np.clip(camera_chain.rescale(values, told.scaling, told.interlacing), 0, 1)
     values = camera_chain.draw(values, told.overlay, None)

@@ -642,6 +642,7 @@ KINDS = {
         "bits": {"sensor.bits": 8},
         "mosaic": {"sensor.mosaic.pattern": "rggb"},
         "colour": {"sensor.colour.white_balance": [1.2, 1.0, 1.1]},
+        "denoising": {"sensor.denoising.level": 0.1},
         "sharpening": {"sensor.sharpening.amount": 0.5},
         "scaling": {"sensor.scaling.factor": 0.5},
         "overlay": {"sensor.overlay.boxes": [{"x": 0, "y": 0, "width": 0.1, "height": 0.1}]},

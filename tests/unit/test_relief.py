@@ -260,6 +260,12 @@ def test_patches_are_a_smooth_level_of_the_given_deviation_and_wavelength():
     assert (filled <= highest + np.log(2) * field.meniscus + 1e-15).all()
 
 
+def test_the_longest_patches_are_no_higher_than_asked_for():
+    field = make_relief(Relief(bands=(BAND,), seed=2), -0.2, Patches(wavelength_mm=20.0, amplitude=1.5))
+    level = field.patch_jets(np.random.default_rng(8).uniform(-800, 800, (20_000, 3))).value
+    assert level.std() == pytest.approx(1.5 * field.deviation, rel=0.06)
+
+
 def test_the_surface_of_patches_has_the_derivatives_of_its_height():
     field = make_relief(Relief(bands=(BAND,), seed=2), -0.2, PATCHES)
     x = np.random.default_rng(9).uniform(-20, 20, (400, 3))

@@ -34,13 +34,13 @@ KNOWN: tuple[tuple[str, str, str], ...] = (
     ("film patches", r"reflectance\.film\.patches\.(wavelength_mm|amplitude|dry_level)", ""),
     ("colour of the tissue", r"reflectance\.albedo\.(base\.\d|blood)", ""),
     ("texture contrast", r"reflectance\.albedo\.(mottling\.amplitude|vessels\.strength|capillaries\.strength)", ""),
-    ("exposure", r"sensor\.exposure\.(average|percentile|gain|full_scale)", ""),
+    ("exposure", r"sensor\.exposure\.(average|centre|percentile|gain|full_scale)", ""),
     ("vignetting", r"sensor\.vignetting\.power", ""),
     ("profile of the light", r"rig\.(each|lights\.\d+)\.profile\.power", ""),
     ("source size", r"rig\.(each|lights\.\d+)\.source\.radius_mm", "mm"),
     ("distance", r"surface\.(distance_mm|recipe\.radius_mm|radius_mm|off_axis_share|look_ahead_mm)", ""),
     ("sharpening", r"sensor\.sharpening\.(amount|radius_px)", ""),
-    ("noise", r"sensor\.(full_well|read_noise|noise_sigma)", ""),
+    ("noise", r"sensor\.(full_well|read_noise|noise_sigma|denoising\.(radius_px|level))", ""),
     ("point spread", r"sensor\.point_spread_px", "px"),
 )
 """What can be fitted: its name, the key paths that hold it, and its unit where all of them share one."""
