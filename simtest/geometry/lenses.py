@@ -436,7 +436,10 @@ class KannalaBrandt:
         target = np.asarray(m, dtype=float)
         radius = np.hypot(target[..., 0], target[..., 1])
         top = self.limit_angle
-        theta = invert(self.radial, radius, top, float(self.radial(np.array(top))[0]))
+        if not any((self.k1, self.k2, self.k3, self.k4)):
+            theta = np.where(radius < top, radius, np.nan)
+        else:
+            theta = invert(self.radial, radius, top, float(self.radial(np.array(top))[0]))
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.where(radius > 0, np.sin(theta) / radius, theta)
         return np.concatenate([target * share[..., None], np.cos(theta)[..., None]], axis=-1)
