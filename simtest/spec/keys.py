@@ -21,7 +21,8 @@ from simtest.spec.toml_files import apply_settings
 
 RIVALS = {
     "camera.fov_deg": ("fx", "fy"), "camera.fx": ("fov_deg", "fov_of"), "camera.fy": ("fov_deg", "fov_of"),
-    "sensor.exposure.full_scale": ("percentile", "average"), "sensor.exposure.percentile": ("full_scale", "average"),
+    "sensor.exposure.full_scale": ("percentile", "average", "centre"),
+    "sensor.exposure.percentile": ("full_scale", "average", "centre"),
     "sensor.exposure.average": ("full_scale", "percentile"),
     "known.distance_mm": ("distance_error",), "known.distance_error": ("distance_mm",),
     "rig.preset": ("lights",),

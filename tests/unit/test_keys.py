@@ -5,11 +5,13 @@ from functools import reduce
 
 import pytest
 
+from simtest.dataset.plan import Plan
 from simtest.errors import InputError
 from simtest.runtime.resources import find
 from simtest.spec import Scene, load_calibration, load_dataset, load_experiment, load_scene, read_toml
 from simtest.spec.keys import describe_key, name_key, replace_values
 from simtest.spec.scene import scene_from_dict
+from simtest.spec.sensor import Exposure
 from simtest.spec.toml_files import apply_settings, toml_tables, toml_value
 from simtest.validation.cases import expand
 from tests.refusals import refused
@@ -78,6 +80,7 @@ def test_a_setting_replaces_what_it_excludes_of_a_group_too():
 def test_what_excludes_a_drawn_value_fixes_it_too():
     dataset = load_dataset("endoscopy", {"sensor.exposure.percentile": 99.0})
     assert not [key for family in dataset.families for key in family.per_sample if key.startswith("sensor.exposure")]
+    assert Plan(dataset).draw(0).scene.sensor.exposure == Exposure(percentile=99.0)
 
 
 @pytest.mark.parametrize("value", ["-1.0", "'steep'", "{ low = 3.0 }"])
