@@ -451,6 +451,8 @@ def find_spots(light: Image, specular: Image, seen: Mask | None = None) -> Visib
         return empty
     # Maxima that shine, the brightest first; in logarithms the ratio of saddle and peak is a height.
     log = np.log(np.maximum(light, DARK * light.max()))
+    if log.min() >= log.max() + np.log(SADDLE):
+        return empty
     shines = (specular >= LEAST_SPECULAR * light) & (light > DARK * light.max())
     tops = np.flatnonzero(shines & (log >= cv2.dilate(log, np.ones((3, 3), np.uint8))))
     tops = tops[np.argsort(-light.ravel()[tops], kind="stable")]
@@ -483,8 +485,9 @@ def _stands_out(light: Image, log: Image, row: int, column: int) -> bool:
         own = labels == labels[up, left]
         if np.argmax(np.where(own, light[window], -1)) != up * own.shape[1] + left:
             return False
-        inside = row > half, row + half < light.shape[0] - 1, column > half, column + half < light.shape[1] - 1
-        if not any(side.any() for side, more in zip((own[0], own[-1], own[:, 0], own[:, -1]), inside, strict=True) if more):
+        bottom, right = (size - 1 - half for size in light.shape)
+        sides = (own[0], row > half), (own[-1], row < bottom), (own[:, 0], column > half), (own[:, -1], column < right)
+        if not any(is_inside and side.any() for side, is_inside in sides):
             return True
         half *= 2
 
