@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -26,6 +27,7 @@ from simtest.conventions import (
 from simtest.detection import contrast, half_height_component
 from simtest.detection.peaks import Component, component_above
 from simtest.geometry import smooth
+from simtest.geometry.patch import connected
 from simtest.rendering import HighlightPoint, Session
 from simtest.rendering.frames import MisfitMaps
 from simtest.runtime.arrays import Array, Image, IntArray, Mask, short_repr
@@ -437,7 +439,6 @@ def find_spots(light: Image, specular: Image, seen: Mask | None = None) -> Visib
     `seen` the pixels inside the view mask, default all.
     """
     from skimage.measure import label
-    from skimage.morphology import local_maxima, reconstruction
     from skimage.segmentation import watershed
 
     light = np.where(np.isfinite(light), light, 0.0).astype(np.float64)
@@ -448,18 +449,14 @@ def find_spots(light: Image, specular: Image, seen: Mask | None = None) -> Visib
     empty = VisibleSpots(none, none, np.zeros(light.shape, dtype=np.int64))
     if light.max() <= 0:
         return empty
-    # Maxima: in logarithms the ratio of saddle and peak is a height, and these are the h-maxima.
+    # Maxima that shine, the brightest first; in logarithms the ratio of saddle and peak is a height.
     log = np.log(np.maximum(light, DARK * light.max()))
-    flooded = reconstruction(log + np.log(SADDLE), log, method="dilation")
-    summits, count = label(local_maxima(flooded), connectivity=2, return_num=True)
-    if count == 0:
+    if log.min() >= log.max() + np.log(SADDLE):
         return empty
-    # The brightest pixel of each; only those that shine.
-    order = np.argsort(-light, axis=None, kind="stable")
-    order = order[summits.ravel()[order] > 0]
-    _, first = np.unique(summits.ravel()[order], return_index=True)
-    peaks = order[np.sort(first)]
-    peaks = peaks[specular.ravel()[peaks] >= LEAST_SPECULAR * light.ravel()[peaks]]
+    shines = (specular >= LEAST_SPECULAR * light) & (light > DARK * light.max())
+    tops = np.flatnonzero(shines & (log >= cv2.dilate(log, np.ones((3, 3), np.uint8))))
+    tops = tops[np.argsort(-light.ravel()[tops], kind="stable")]
+    peaks = np.array([top for top in tops if _stands_out(light, log, *divmod(int(top), light.shape[1]))], dtype=int)
     if not len(peaks):
         return empty
     rows, columns = np.unravel_index(peaks, light.shape)
@@ -475,6 +472,24 @@ def find_spots(light: Image, specular: Image, seen: Mask | None = None) -> Visib
     held[pieces[rows, columns]] = np.arange(1, len(peaks) + 1)
     held[0] = 0
     return VisibleSpots(np.asarray(rows), np.asarray(columns), held[pieces])
+
+
+def _stands_out(light: Image, log: Image, row: int, column: int) -> bool:
+    """Return whether a pixel's saddle to any brighter one, and to earlier ones as bright, is below `SADDLE`."""
+    half = 8
+    while True:
+        # The window grows until what is above the saddle no longer touches its sides inside the frame.
+        up, left = min(half, row), min(half, column)
+        window = np.s_[row - up : row + half + 1, column - left : column + half + 1]
+        labels = connected(log[window] >= log[row, column] + np.log(SADDLE), diagonally=True)
+        own = labels == labels[up, left]
+        if np.argmax(np.where(own, light[window], -1)) != up * own.shape[1] + left:
+            return False
+        bottom, right = (size - 1 - half for size in light.shape)
+        sides = (own[0], row > half), (own[-1], row < bottom), (own[:, 0], column > half), (own[:, -1], column < right)
+        if not any(is_inside and side.any() for side, is_inside in sides):
+            return True
+        half *= 2
 
 
 def glints_of(spots: VisibleSpots, glints: list[TrueHighlight]) -> list[tuple[int, ...]]:

@@ -8,8 +8,10 @@ import pytest
 from simtest.errors import InputError
 from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces import make_surface
+from simtest.surfaces.colon import build
 from simtest.surfaces.model import RayHits, Shape, SurfaceModel, TriangleMesh
 from simtest.surfaces.poses import MIN_CLEARANCE_MM, camera_path
+from simtest.surfaces.recipe import ColonRecipe
 from tests.marked import marked
 
 
@@ -49,6 +51,17 @@ def test_the_path_keeps_to_the_middle_of_an_open_bent_tube():
     assert turned.mean() == pytest.approx(np.degrees(1 / 40), rel=0.3)
     assert turned.max() < 4
     np.testing.assert_allclose(np.sum(path.tangents * path.sides, axis=1), 0, atol=1e-12)
+
+
+def test_the_path_of_a_closed_tube_is_its_centreline_clear_of_both_ends():
+    surface = build(ColonRecipe(closed=True))
+    path, tube = camera_path(surface), surface.tube
+    at, _, off = tube.slice_of(path.points)
+    np.testing.assert_allclose(off, 0, atol=1e-9)
+    assert (surface.clearance(path.points) > MIN_CLEARANCE_MM).all()
+    # As far from either pole as it usually is from the wall.
+    usual = np.median(surface.clearance(path.points))
+    np.testing.assert_allclose([at[0] + tube.depth, tube.recipe.length_mm + tube.depth - at[-1]], usual, atol=3)
 
 
 def test_a_place_on_the_path_is_continuous_and_goes_straight_on_beyond_its_ends():

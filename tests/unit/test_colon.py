@@ -344,6 +344,20 @@ def test_rows_of_folds_are_staggered_ridges_lie_on_taeniae_and_creases_are_as_hi
     assert 0.1 < (rise > 0.2).mean() < 0.6
 
 
+@pytest.mark.parametrize("count", [40, 9000], ids=["at once", "one by one"])
+@pytest.mark.parametrize("closed", [False, True])
+def test_folds_add_up_wherever_they_reach(closed, count):
+    tube = Tube(ColonRecipe(closed=closed, **HAUSTRA))
+    rng = np.random.default_rng(3)
+    u, v = rng.uniform(0, tube.recipe.length_mm, count), rng.uniform(0, 2 * np.pi, count)
+    whole = tube.recipe.radius_mm + tube.recipe.taenia_mm * np.cos(3 * (v - tube._taenia_phase))
+    for fold in tube._folds:
+        x = u - fold.along - fold.slant * np.sin(v - fold.centre)
+        exponent = -(x**2) / (2 * fold.width**2) + fold.kappa * (np.cos(v - fold.centre) - 1)
+        whole -= fold.depth * np.exp(exponent - fold.steep * exponent**2)
+    np.testing.assert_allclose(tube.radius(u, v).value, whole, rtol=0, atol=1e-12)
+
+
 def test_drawn_polyps_are_as_told_and_change_nothing_else():
     bare = ColonRecipe(seed=3, crease_mm=0.3)
     kinds, sizes = [], []
