@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 from cyclopts import Parameter, Token
 
 from simtest.cli.main import MANNERS
+from simtest.errors import InputError
 from simtest.runtime.files import as_json
 
 if TYPE_CHECKING:
     from simtest.reconstruction.options import Options
     from simtest.runtime.processes import Engine
+    from simtest.spec.recipes import CoreRegions
 
 
 Row = TypeVar("Row")
@@ -182,6 +184,41 @@ class EngineOptions:
 
 
 ONE_PROCESS = EngineOptions()
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class RegionOptions:
+    """Calibrations of cores, and what is refused by them."""
+
+    regions: Annotated[
+        list[Path] | None,
+        path("Calibration of a core, of simtest calibrate core: its answers get regions; may be repeated."),
+    ] = None
+    refuse_above: Annotated[float | None, about("Refuse answers whose calibrated 95 % radius is larger, deg.")] = None
+    shifted: Annotated[
+        Literal["widen", "refuse"],
+        about("What answers in frames unlike the calibration's get: the region of the worst stratum, or none."),
+    ] = "widen"
+
+    def read(self) -> "CoreRegions | None":
+        """Return them as an experiment and the reconstruction take them; None where no calibration is given."""
+        if self.regions is None:
+            if self.refuse_above is not None or self.shifted != "widen":
+                raise InputError("--refuse-above and --shifted need --regions")
+            return None
+        from simtest.reconstruction.regions import read_calibrations
+        from simtest.spec.recipes import CoreRegions
+        from simtest.spec.spec_model import validate
+
+        # Files before the work; workers may have another current folder.
+        files = [str(file.resolve()) for file in self.regions]
+        read_calibrations(files)
+        given = {"files": files, "refuse_above_deg": self.refuse_above, "shifted": self.shifted}
+        return validate(CoreRegions, given, "--regions")
+
+
+NO_REGIONS = RegionOptions()
 
 
 @Parameter(name="*")

@@ -11,10 +11,12 @@ from simtest.api import Extras, reconstruct_picture
 from simtest.cli.common import (
     DEFAULTS,
     MOST_ROWS,
+    NO_REGIONS,
     OUT,
     NamedPath,
     Out,
     PictureOptions,
+    RegionOptions,
     Seed,
     Table,
     Told,
@@ -63,6 +65,7 @@ def reconstruct(
     *,
     out: Annotated[Path | None, path("Folder for the results; default reports/normals/IMAGE.", OUT)] = None,
     known: PictureOptions = DEFAULTS,
+    calibrated: RegionOptions = NO_REGIONS,
     roi: Annotated[str | None, about("Region of interest x,y,w,h in px; default: detected.")] = None,
     extras: Annotated[Extras, Parameter(name="*")] = NO_EXTRAS,
     poses: Annotated[
@@ -88,7 +91,7 @@ def reconstruct(
         raise InputError(f"{image}: --reference, --camera-from-model and --depth are for single pictures")
     if poses and not sequence:
         raise InputError(f"{image}: --poses is for a folder or a film")
-    options = known.checked(roi=None if roi is None else parse_roi(roi), poses=poses)
+    options = known.checked(roi=None if roi is None else parse_roi(roi), poses=poses, regions=calibrated.read())
     if sequence:
         return _sequence(image, out, options)
     spots, files = reconstruct_picture(image, out, options, extras)

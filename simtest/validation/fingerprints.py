@@ -18,7 +18,7 @@ def fingerprint(experiment: Experiment, cases: list[Case], variant: str) -> str:
         {
             "experiment": experiment.model_dump(mode="json"),
             "scenes": [case.data for case in cases],
-            "inputs": input_hashes(cases),
+            "inputs": input_hashes(cases) | _regions(experiment),
             "versions": provenance.versions() | ESTIMATORS.distributions(experiment.estimators),
             "cores": core_hashes(experiment.estimators),
             "source": provenance.source_hash(),
@@ -34,6 +34,12 @@ def definition(experiment: Experiment, cases: list[Case]) -> str:
     scenes = [case.data for case in cases]
     itself = experiment.model_dump(mode="json", exclude={"title", "description"})
     return _hash({"experiment": itself, "scenes": scenes, "inputs": files})
+
+
+def _regions(experiment: Experiment) -> dict[str, str]:
+    """Return the hashes of the calibrations of cores."""
+    files = () if experiment.regions is None else experiment.regions.files
+    return {file: provenance.file_hash(Path(file)) for file in files}
 
 
 def _hash(content: Json) -> str:

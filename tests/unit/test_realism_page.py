@@ -15,7 +15,7 @@ from simtest.pages.charts import png
 from simtest.realism.compare import Comparison, SetOfFrames, compare, distances, mean_distribution
 from simtest.realism.frames import NamedFrame, _Film, open_frames
 from simtest.realism.page import distance_chart, distribution_charts, write_comparison
-from simtest.realism.statistics import COLUMNS
+from simtest.reconstruction.statistics import COLUMNS
 from simtest.reconstruction.images import Source, open_source
 
 

@@ -1,0 +1,226 @@
+"""Regions of 68 and 95 % for the normals of any core, by what its calibration on rendered frames found.
+
+`simtest calibrate core` writes the file (`simtest.advice.core_calibration`). It parts the answers into strata by what
+can be seen without the truth, and states of each how large the errors of 68 and 95 % of the answers were at most, over
+the standard deviation that the core reports, or in deg where it reports none. Frames unlike those of the calibration,
+by the statistics that realism is measured by, get the region of the worst stratum, or none.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, JsonValue, model_validator
+
+from simtest.conventions import HIGHLIGHT_ISOVALUE
+from simtest.detection.detector import Kind
+from simtest.errors import Failure, InputError, Reason
+from simtest.estimators import Estimate
+from simtest.estimators.protocol import CalibratedRegion, Target
+from simtest.reconstruction.images import is_coloured
+from simtest.reconstruction.options import Choices, Options
+from simtest.reconstruction.statistics import LEAST_SIDE, NAMES, measure, summarise
+from simtest.runtime.arrays import Array, Image
+from simtest.runtime.files import read_json
+from simtest.spec.spec_model import Spec, validate
+
+if TYPE_CHECKING:
+    from simtest.reconstruction.records import Specularity
+
+FORMAT = "simtest core calibration, version 1"
+LEVELS = (0.68, 0.95)
+
+Feature = Literal["sigma_deg", "score", "radius_px", "border", "flags", "kind"]
+
+MOST_DEG = 180.0
+"""No direction is farther off."""
+
+Positive = Annotated[float, Field(ge=0)]
+
+Radii = tuple[Positive, Positive]
+"""At 68 and at 95 %."""
+
+# The file -------------------------------------------------------------------------------------------------------------
+
+
+class Stratum(Spec):
+    """Answers that are alike by what can be seen, and how large the errors of 68 and 95 % of them are at most."""
+
+    ends: dict[Feature, tuple[float | None, float | None]] = Field(description="of its features: at least, and below")
+    highlights: int = Field(ge=1, description="it stands on")
+    frames: int = Field(ge=1, description="that these are of")
+    error_deg: Radii
+    ratio: Radii | None = Field(description="over the reported standard deviation; None where not all report one")
+
+    def holds(self, seen: Mapping[str, float]) -> bool:
+        """Return whether an answer with these features belongs to it."""
+        return all(
+            (low is None or seen[name] >= low) and (high is None or seen[name] < high)
+            for name, (low, high) in self.ends.items()
+        )
+
+    def radii(self, sigma_deg: float) -> Radii:
+        """Return the region of an answer in it, deg; `sigma_deg` is -1 where the core reports none."""
+        scale, (first, last) = (1.0, self.error_deg) if self.ratio is None or sigma_deg < 0 else (sigma_deg, self.ratio)
+        return min(scale * first, MOST_DEG), min(scale * last, MOST_DEG)
+
+
+class Shift(Spec):
+    """Where the statistics of the calibration's frames lie, and how far off at most 5 % of such frames are."""
+
+    centre: tuple[float, ...]
+    whitening: tuple[tuple[float, ...], ...] = Field(description="takes them to unit covariance")
+    limit: Positive
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if {len(self.centre), len(self.whitening), *map(len, self.whitening)} != {len(NAMES)}:
+            raise ValueError(f"must have {len(NAMES)} statistics")
+        return self
+
+    def distance(self, statistics: Array) -> float:
+        """Return how far off a frame is, in standard deviations; what it does not tell counts as the centre."""
+        off = np.nan_to_num(statistics - np.array(self.centre), nan=0.0)
+        return float(np.linalg.norm(np.array(self.whitening) @ off))
+
+
+class CoreCalibration(Spec):
+    """What was found of a core on frames of a scope."""
+
+    format: Literal["simtest core calibration, version 1"] = FORMAT
+    core: str = Field(min_length=1, description="its name in results")
+    scope: str
+    organ: str
+    size: tuple[int, int] = Field(description="of the frames, px")
+    detector: Literal["colour", "peaks"]
+    every: bool = Field(description="whether highlights were taken that are not isolated")
+    highlights: int = Field(ge=1, description="answers in all")
+    frames: int = Field(ge=1, description="that these are of")
+    strata: dict[Target, tuple[Stratum, ...]] = Field(min_length=1, description="by the surface whose normal is stated")
+    shift: Shift | None = Field(description="None where the frames are grey")
+    made: dict[str, JsonValue] = Field(description="of what, and with which versions")
+
+    def outside(self, image: Image, choices: Choices, every: bool) -> str:
+        """Return in what a frame is unlike those of the calibration; empty where it is like them."""
+        size = image.shape[1], image.shape[0]
+        if size != self.size:
+            return f"{size[0]} x {size[1]} px, not {self.size[0]} x {self.size[1]}"
+        if (choices.detector, every) != (self.detector, self.every):
+            of = {True: "all highlights", False: "isolated highlights"}
+            return f"{of[every]} found by {choices.detector}, not {of[self.every]} by {self.detector}"
+        if self.shift is None:
+            return ""
+        statistics = statistics_of(image)
+        distance = math.inf if statistics is None else self.shift.distance(statistics)
+        return f"{distance:.3g} standard deviations off" if distance > self.shift.limit else ""
+
+    def region(self, seen: Mapping[str, float], target: Target, outside: str) -> CalibratedRegion | None:
+        """Return the region of an answer with these features; None where its surface's normal was not calibrated.
+
+        In a frame that is `outside` it is that of the worst stratum: the largest ratio to the reported deviation, and
+        no less than the largest error.
+        """
+        strata, sigma = self.strata.get(target, ()), seen["sigma_deg"]
+        if not strata:
+            return None
+        if outside:
+            radii = [each.radii(deviation) for each in strata for deviation in (sigma, -1.0)]
+            first, last = (max(each) for each in zip(*radii, strict=True))
+            return CalibratedRegion(first, last, f"the worst of {self.highlights} highlights of {self.scope}: {outside}")
+        own = next((each for each in strata if each.holds(seen)), None)
+        if own is None:
+            return None
+        source = f"calibrated on {self.highlights} highlights of {self.scope}, {own.highlights} like this one"
+        return CalibratedRegion(*own.radii(sigma), source)
+
+
+@lru_cache(maxsize=8)
+def _read(path: Path, _: float) -> CoreCalibration:
+    return validate(CoreCalibration, read_json(path, "a calibration of simtest calibrate core"), str(path))
+
+
+def read_calibrations(files: Sequence[str | Path]) -> dict[str, CoreCalibration]:
+    """Read the calibrations of cores, by the cores' names in results."""
+    made = dict[str, CoreCalibration]()
+    for file in map(Path, files):
+        if not file.is_file():
+            raise InputError(f"{file}: no such file; must be a calibration of simtest calibrate core")
+        read = _read(file, file.stat().st_mtime)
+        if read.core in made:
+            raise InputError(f"{file}: is of the core {read.core}, as another file; one must be given")
+        made[read.core] = read
+    return made
+
+
+# What a frame's answers get -------------------------------------------------------------------------------------------
+
+
+def with_regions(
+    spots: "Sequence[Specularity]", image: Image, choices: Choices, options: Options
+) -> "list[Specularity]":
+    """Return the specularities of a frame with the regions of the calibrated cores' answers, or with their refusals.
+
+    Raises `InputError` where none of the files is of an estimator that is run.
+    """
+    regions = options.regions
+    assert regions is not None
+    files = read_calibrations(regions.files)
+    if not files.keys() & {*choices.estimators}:
+        raise InputError(
+            f"{', '.join(map(str, regions.files))}: of {', '.join(files)}, which is not run; estimators: "
+            f"{', '.join(choices.estimators) or 'none'}"
+        )
+    outside = {name: own.outside(image, choices, options.every) for name, own in files.items()}
+    size = image.shape[1], image.shape[0]
+
+    def judged(spot: "Specularity", name: str, estimate: Estimate) -> Estimate | Failure:
+        if name not in files:
+            return estimate
+        if outside[name] and regions.shifted == "refuse":
+            return Failure(Reason.REFUSED, f"the frame is unlike those of the calibration: {outside[name]}")
+        found = files[name].region(features(spot, estimate, size), estimate.target, outside[name])
+        if found is not None and regions.refuse_above_deg is not None and found.radius_95_deg > regions.refuse_above_deg:
+            over = f"{found.radius_95_deg:.3g} deg, above {regions.refuse_above_deg:g}"
+            return Failure(Reason.REFUSED, f"its calibrated 95 % radius is {over}")
+        return estimate if found is None else replace(estimate, calibrated=found)
+
+    made = []
+    for spot in spots:
+        given = {
+            name: judged(spot, name, result) if isinstance(result, Estimate) else result
+            for name, result in spot.estimates.items()
+        }
+        organ = {name: judged(spot, name, each) for name, each in spot.organ.items()}
+        kept = {name: each for name, each in organ.items() if isinstance(each, Estimate)}
+        made.append(replace(spot, estimates=given, organ=kept))
+    return made
+
+
+def statistics_of(image: Image) -> Array | None:
+    """Return a frame's realism statistics, NaN where it does not tell one; None of a grey or a very small frame."""
+    if min(image.shape[:2]) < LEAST_SIDE or not is_coloured(image):
+        return None
+    return summarise(measure(np.asarray(image, np.float32)))
+
+
+def features(spot: "Specularity", estimate: Estimate, size: tuple[int, int]) -> dict[str, float]:
+    """Return what strata are made by: all of it can be seen without the truth.
+
+    They are the reported standard deviation, deg, -1 where there is none; the detection's score, -1 likewise; the
+    radius at half height, px; the peak's distance to the frame's border over the frame's width; the number of flags;
+    the number of the kind, -1 where the detector tells none.
+    """
+    patch, (x, y), (width, height) = spot.patch, spot.position_px, size
+    area = 0.0 if isinstance(patch, Failure) else float(np.count_nonzero(patch.inside(HIGHLIGHT_ISOVALUE, cut=True)))
+    return {
+        "sigma_deg": -1.0 if estimate.deviation_deg is None else estimate.deviation_deg,
+        "score": -1.0 if spot.score is None else spot.score,
+        "radius_px": math.sqrt(area / math.pi),
+        "border": max(float(min(x, y, width - x, height - y)), 0.0) / width,
+        "flags": float(len(estimate.flags)),
+        "kind": -1.0 if spot.kind is None else float([*Kind].index(Kind(spot.kind))),
+    }
