@@ -1,87 +1,347 @@
 """Calibrates a core: renders frames of a scope, runs the core on them, and finds how large its errors are by stratum.
 
-The frames are those of `simtest advise`: walls of an organ at drawn forms, poses and reliefs. Detection, answers and
-their matching with the truth are those of a run; what matches no true highlight is judged at the answer's own pixel.
+The frames are those of `simtest advise`: walls of an organ at drawn distances, forms, poses and reliefs. Detection,
+answers and their matching with the truth are those of a run; an answer that matches no true highlight is judged at the
+pixel that it looks at. Regions are split conformal: of n answers in K frames, drawn as those are that the core will
+meet, at least 95 % lie within the error of rank 0.95 n (K + 1) / K. The frame is the unit, as highlights of one frame
+share its wall and its light [Dunn, Wasserman and Ramdas, J. Am. Stat. Assoc. 118, 2023, 2491]: the new frame counts as
+one whose answers are all farther off.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 
 from simtest.advice.plan import DISTANCES, Question, main_experiment
 from simtest.dataset.scoring.frames import CaseFrames, RenderedFrame
+from simtest.errors import InputError
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
-from simtest.estimators.names import forgive_cores
+from simtest.estimators.names import absolute_names, close_cores, core_hashes, forgive_cores, short_name
+from simtest.estimators.protocol import Target
+from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
-from simtest.reconstruction.regions import MOST_DEG, features, statistics_of
+from simtest.reconstruction.records import Specularity
+from simtest.reconstruction.regions import (
+    LEVELS,
+    MOST_DEG,
+    CoreCalibration,
+    Feature,
+    Shift,
+    Stratum,
+    features,
+    statistics_of,
+)
+from simtest.runtime import provenance
+from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.files import JsonObject, make_folder, read_json, write_json
+from simtest.runtime.processes import Engine, OnStep, make_engine
 from simtest.runtime.seeds import Stage, integer
 from simtest.validation.cases import expand
+from simtest.validation.columns import Row
 from simtest.validation.realisation import answer, score
-from simtest.geometry.vectors import angle_deg
+from simtest.validation.runner import Progress, variant_of
 
-Answered = dict[str, Any]
+BATCHES = 8
+"""Frames of so many batches at least, `DISTANCES` frames each: fewer tell no quantile of 95 %."""
+
+MOST_BATCHES = 500
+
+LEAST_HIGHLIGHTS, LEAST_FRAMES = 100, 30
+"""A stratum stands on so many answers in so many frames, or is no stratum of its own."""
+
+ORDER: tuple[Feature, ...] = ("sigma_deg", "axis_ratio", "score", "radius_px", "flags", "border", "kind")
+"""In which strata are parted, each at the median of what is left."""
+
+FALSE_ALARMS = 0.05
+SHRINKAGE = 0.1
+"""Share of unit covariance in that of the frames' statistics: they are about as many as a tenth of the frames."""
 
 
-def batch_of(question: Question, batch: int) -> Question:
-    seed = integer(question.seed, "calibrate core", "batch", batch, Stage.SWEEP)
+# Answers to frames ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Some frames of a scope that a core answers to."""
+
+    question: Question
+    core: str
+    detector: str
+    every: bool
+    path: Path  # where its answers are kept
+
+    def make(self, on_step: OnStep) -> None:
+        """Render the frames, run the core and keep its answers."""
+        # The answers must not depend on the batches before.
+        forgive_cores()
+        estimators, frames = load_estimators([self.core]), list[JsonObject]()
+        experiment = main_experiment(self.question)
+        cases = expand(experiment)
+        variant = variant_of(cases)
+        for number, case in enumerate(cases):
+            for frame in CaseFrames(experiment, case, number, variant):
+                told = statistics_of(frame.image)
+                known = None if told is None else [float(v) if np.isfinite(v) else None for v in told]
+                frames.append(
+                    {"statistics": known, "answers": answers_of(frame, estimators, self.detector, self.every)}
+                )
+                on_step()
+        write_json(self.path, frames, compact=True)
+
+
+def make_batch(batch: Batch, on_step: OnStep) -> None:
+    """Make a batch in a worker."""
+    batch.make(on_step)
+
+
+def answers_of(
+    frame: RenderedFrame, estimators: Mapping[str, AnyEstimator], detector: str, every: bool
+) -> list[JsonObject]:
+    """Return the features and the error of each answer to a frame, as the fine surface's normal and as the base's.
+
+    Found by colour the frame is taken as a picture of 8 bits, as `simtest reconstruct` takes one; by peaks as a run
+    takes it.
+    """
+    spots: Sequence[Specularity]
+    if detector == "peaks":
+        spots = answer(frame.view, frame.image, estimators, not every)
+    else:
+        picture = np.round(255 * frame.image).astype(np.uint8)
+        spots = reconstruct(picture, frame.calibration, estimators, isolated=not every, detector=detector)
+    told: list[tuple[Row, Specularity, Estimate]] = []
+    for row in score(frame.session, frame.view, spots, estimators, {}, not every).rows:
+        if row["status"] == "ok":
+            spot, name = spots[int(str(row["specularity"]))], str(row["estimator"])
+            given = spot.estimates[name], spot.organ[name]
+            stated = {each.target: each for each in given if isinstance(each, Estimate)}
+            told += [(row, spot, each) for each in stated.values()]
+    if not told:
+        return []
+    height, width = frame.image.shape[:2]
+    at = frame.session.exact_points(np.array([estimate.look_px for _, _, estimate in told]))
+    metal = frame.view.instruments
+    made = []
+    for i, (row, spot, estimate) in enumerate(told):
+        error = row.get(f"error_{estimate.target}_deg")
+        if error is None:
+            x, y = (min(max(int(v), 0), n - 1) for v, n in zip(estimate.look_px, (width, height), strict=True))
+            tissue = at.valid[i] and (metal is None or not metal[y, x])
+            normal = (at.normal if estimate.target == "fine" else at.normal_base)[i]
+            error = float(angle_deg(estimate.normal, normal)) if tissue else MOST_DEG
+        seen: JsonObject = {**features(spot, estimate, (width, height))}
+        made.append({**seen, "target": estimate.target, "error_deg": error, "is_true": row["true_id"] is not None})
+    return made
+
+
+# Strata ---------------------------------------------------------------------------------------------------------------
+
+
+def quantile(values: Array, frames: IntArray, level: float) -> float:
+    """Return what at least a share `level` of the answers in a new frame stays below; inf where too few frames tell."""
+    count = len(np.unique(frames))
+    rank = math.ceil(len(values) * level * (count + 1) / count - 1e-9)
+    return float(np.sort(values)[rank - 1]) if rank <= len(values) else math.inf
+
+
+def strata_of(seen: Mapping[Feature, Array], error_deg: Array, frames: IntArray) -> tuple[Stratum, ...]:
+    """Part answers into strata by their features, shape (N,) each, and find the quantiles of their errors.
+
+    The cuts are medians of what is seen: they do not depend on the errors.
+    """
+    everything = np.arange(len(error_deg))
+    parts = _parted(seen, frames, everything, {}, ORDER)
+    return tuple(_stratum(seen["sigma_deg"][own], error_deg[own], frames[own], ends) for own, ends in parts)
+
+
+Ends = dict[Feature, tuple[float | None, float | None]]
+
+
+def _parted(
+    seen: Mapping[Feature, Array], frames: IntArray, own: IntArray, ends: Ends, order: Sequence[Feature]
+) -> list[tuple[IntArray, Ends]]:
+    """Part answers, given by their indices, at each feature in turn where both halves are large enough."""
+    for i, name in enumerate(order):
+        values = seen[name][own]
+        cut = float(np.median(values))
+        if cut == values.min():
+            # Half and more are alike: these, and the others.
+            cut = float(min(values[values > cut], default=cut))
+        halves = own[values < cut], own[values >= cut]
+        if all(len(half) >= LEAST_HIGHLIGHTS and len(np.unique(frames[half])) >= LEAST_FRAMES for half in halves):
+            low, high = ends.get(name, (None, None))
+            sides = zip(halves, ((low, cut), (cut, high)), strict=True)
+            return [
+                part
+                for half, side in sides
+                for part in _parted(seen, frames, half, ends | {name: side}, order[i + 1 :])
+            ]
+    return [(own, ends)]
+
+
+def _stratum(sigma_deg: Array, error_deg: Array, frames: IntArray, ends: Ends) -> Stratum:
+    def radii(values: Array) -> tuple[float, float]:
+        first, last = (quantile(values, frames, level) for level in LEVELS)
+        return first, last
+
+    ratio = radii(error_deg / sigma_deg) if np.all(sigma_deg > 0) else None
+    count = len(np.unique(frames))
+    return Stratum(ends=ends, highlights=len(error_deg), frames=count, error_deg=radii(error_deg), ratio=ratio)
+
+
+def shift_of(statistics: Array) -> Shift:
+    """Find how far off frames of the calibration are, by their statistics, shape (frames, S), NaN where not told.
+
+    The centre and covariance are those of one half of the frames, the limit is the conformal quantile of the other's.
+    """
+    first, second = statistics[::2], statistics[1::2]
+    centre = np.nanmean(first, axis=0)
+    spread = np.nanstd(first, axis=0) + 1e-9
+    scaled = np.nan_to_num((first - centre) / spread, nan=0.0)
+    covariance = (1 - SHRINKAGE) * np.cov(scaled.T) + SHRINKAGE * np.eye(len(centre))
+    values, vectors = np.linalg.eigh(covariance)
+    whitening = (vectors / np.sqrt(values)).T / spread
+    found = Shift(centre=tuple(centre.tolist()), whitening=tuple(map(tuple, whitening.tolist())), limit=0.0)
+    off = np.array([found.distance(each) for each in second])
+    limit = quantile(off, np.arange(len(off)), 1 - FALSE_ALARMS)
+    return found.model_copy(update={"limit": limit})
+
+
+# The whole ------------------------------------------------------------------------------------------------------------
+
+
+def calibrate_core(
+    core: str, question: Question, out: Path, highlights: int = 2400, detector: str = "colour", every: bool = False,
+    engine: Engine | None = None, progress: Progress | None = None,
+) -> CoreCalibration:  # fmt: skip
+    """Calibrate a core on frames of a scope, and write the calibration; a stopped one goes on.
+
+    Parameters
+    ----------
+    core : str
+        An installed estimator, or a command or file as `simtest validate` takes it.
+    question : Question
+        Scope, organ, distances and seed.
+    out : Path
+        File of the calibration; the answers to the frames are kept in a folder beside it, and used again.
+    highlights : int
+        Answers at least.
+    detector : {"colour", "peaks"}
+        How highlights are found: as `simtest reconstruct` finds them in pictures, or as `simtest validate` does.
+    every : bool
+        Take highlights that are not isolated too.
+    engine : Engine, optional
+        Runs the batches; the result does not depend on it.
+    progress : callable, optional
+        Called with frames done, frames in all, and what is being done.
+
+    Raises
+    ------
+    InputError
+        If the core is unknown, answers too seldom, or the folder holds answers of something else.
+    """
+    name = short_name(core)
+    load_estimators([core])
+    folder = out.with_suffix(".frames")
+    make_folder(folder)
+    settings = _settings(core, question, detector, every)
+    _check(folder / "settings.json", settings)
+    chosen, frames = engine or make_engine(), list[JsonObject]()
+    (absolute,) = absolute_names([core])
+    try:
+        while (wanted := _batches(frames, highlights, name)) * DISTANCES > len(frames):
+            batches = [
+                Batch(_drawn(question, number), absolute, detector, every, folder / f"{number:04d}.json")
+                for number in range(wanted)
+            ]
+            _make(batches, chosen, progress)
+            frames = [frame for batch in batches for frame in read_json(batch.path)]
+    finally:
+        close_cores()
+    calibration = calibration_of(name, frames, question, detector, every, settings)
+    write_json(out, calibration.model_dump(mode="json"))
+    return calibration
+
+
+def _drawn(question: Question, number: int) -> Question:
+    """Return the question of a batch: a frame at each distance, of a seed of its own."""
+    seed = integer(question.seed, "calibrate core", "batch", number, Stage.SWEEP)
     return replace(question, frames=DISTANCES, seed=seed)
 
 
-def frames_of(question: Question, variant: str | None = None):
-    experiment = main_experiment(question)
-    for number, case in enumerate(expand(experiment)):
-        yield from CaseFrames(experiment, case, number, variant)
+def _batches(frames: Sequence[JsonObject], wanted: int, core: str) -> int:
+    """Return how many batches hold enough answers, by those that are there."""
+    if not frames:
+        return BATCHES
+    count = len(frames) // DISTANCES
+    have = max(sum(each["target"] == of for frame in frames for each in frame["answers"]) for of in ("fine", "base"))
+    if have >= wanted:
+        return count
+    needed = math.ceil(wanted * count / have) if have else MOST_BATCHES + 1
+    if needed > MOST_BATCHES:
+        raise InputError(
+            f"{core}: {have} answers in {len(frames)} frames; {wanted} take more than {MOST_BATCHES * DISTANCES}"
+        )
+    return max(needed, count + 1)
 
 
-def answers_of(frame: RenderedFrame, estimators: Mapping[str, AnyEstimator], like: str) -> list[Answered]:
-    if like == "reconstruct":
-        picture = np.round(255 * frame.image).astype(np.uint8)
-        spots, isolated = reconstruct(picture, frame.calibration, estimators), True
+def _make(batches: Sequence[Batch], engine: Engine, progress: Progress | None) -> None:
+    """Make the batches that are not there yet."""
+    missing = [batch for batch in batches if not batch.path.exists()]
+    total, done = DISTANCES * len(batches), DISTANCES * (len(batches) - len(missing))
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        if progress:
+            progress(done, total, "rendering and answering")
+
+    for _ in engine.run(make_batch, missing, step):
+        pass
+
+
+def _settings(core: str, question: Question, detector: str, every: bool) -> JsonObject:
+    """Return all that the answers depend on."""
+    scope = question.scope
+    return {
+        "core": core, "files": core_hashes([core]).get(core, {}), "scope": scope.tables,
+        "relief": None if scope.relief is None else scope.relief.model_dump(mode="json"), "organ": question.organ,
+        "distances_mm": [*question.distances_mm], "seed": question.seed, "detector": detector, "every": every,
+        "version": provenance.version(), "source": provenance.source_hash(),
+    }  # fmt: skip
+
+
+def _check(path: Path, settings: JsonObject) -> None:
+    """Keep the settings; raise `InputError` where answers of others stand."""
+    if path.exists():
+        before = read_json(path)
+        if changed := [key for key in settings if before.get(key) != settings[key]]:
+            raise InputError(
+                f"{path.parent}: holds answers with another {', '.join(changed)}; remove it, or give another --out"
+            )
     else:
-        isolated = False
-        spots = answer(frame.view, frame.image, estimators, isolated)
-    rows = score(frame.session, frame.view, spots, estimators, {}, isolated).rows
-    made = []
-    for row in rows:
-        if row["status"] != "ok":
-            continue
-        spot, name = spots[row["specularity"]], row["estimator"]
-        stated = spot.estimates[name]
-        for estimate in dict.fromkeys(e.target for e in (stated, spot.organ[name])):
-            pass
-        for estimate in ([stated] if stated.target == "base" else [stated, spot.organ[name]]):
-            made.append((row, spot, estimate))
-    if not made:
-        return []
-    looks = np.stack([e.look_px for _, _, e in made])
-    at = frame.session.exact_points(looks)
-    answered = []
-    size = frame.image.shape[1], frame.image.shape[0]
-    for n, (row, spot, estimate) in enumerate(made):
-        target = estimate.target
-        error = row.get(f"error_{target}_deg")
-        normal = (at.normal if target == "fine" else at.normal_base)[n]
-        look = float(angle_deg(estimate.normal, normal)) if at.valid[n] else MOST_DEG
-        if error is None:
-            error = look
-        answered.append({
-            "estimator": row["estimator"], "target": target, "error_deg": error, "look_deg": look, "false": row["true_id"] is None,
-            "visible": row.get("visible_id") is not None,
-            **features(spot, estimate, size),
-            # study
-            "s": row["specularity"], "flag_text": ",".join(estimate.flags), "axis_ratio": estimate.axis_ratio,
-            "contrast": spot.region.contrast, "peak": spot.peak_px.tolist() if spot.peak_px is not None else None,
-            "n_spots": len(spots), "margin": estimate.choice_margin, "n_cand": len(estimate.candidates),
-            "saturated": row.get("saturated_share"),
-            "area1": None if estimate.cloud is None else len(estimate.cloud.points_px),
-            "cov": None if estimate.covariance is None else estimate.covariance.tolist(),
-            "m2": row.get("mahalanobis2") if target == stated_target(spot, row) else None,
-            "hl": None if spot.highlight is None else [spot.highlight.area_px, spot.highlight.axis_ratio, spot.highlight.residual, spot.highlight.wander, spot.highlight.tint, spot.highlight.clutter, spot.highlight.clipped],
-        })
-    return answered
+        write_json(path, settings)
 
-def stated_target(spot, row):
-    return spot.estimates[row["estimator"]].target
+
+def calibration_of(
+    name: str, frames: Sequence[JsonObject], question: Question, detector: str, every: bool, settings: JsonObject
+) -> CoreCalibration:
+    """Return the calibration by the answers to frames."""
+    strata: dict[Target, tuple[Stratum, ...]] = {}
+    numbered = [(i, each) for i, frame in enumerate(frames) for each in frame["answers"]]
+    for target in ("fine", "base"):
+        own = [(i, each) for i, each in numbered if each["target"] == target]
+        if own:
+            seen: dict[Feature, Array] = {key: np.array([each[key] for _, each in own], float) for key in ORDER}
+            errors, of = np.array([each["error_deg"] for _, each in own]), np.array([i for i, _ in own])
+            strata[target] = strata_of(seen, errors, of)
+    told = [frame["statistics"] for frame in frames]
+    scope = question.scope
+    return CoreCalibration(
+        core=name, scope=scope.name, organ=question.organ, size=scope.size, detector=detector, every=every,
+        highlights=max(sum(each.highlights for each in own) for own in strata.values()), frames=len(frames),
+        strata=strata, shift=None if None in told else shift_of(np.array(told, float)),
+        made={**settings, **provenance.environment()},
+    )  # fmt: skip

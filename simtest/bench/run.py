@@ -93,8 +93,8 @@ def run_bench(
     """Run a core, an installed estimator or a command, on a suite and write its certificate; a stopped run goes on.
 
     `folder` gets a run's folder for each part, by default all that are scored by highlights, and certificate.json. The
-    figures do not depend on the engine. `regions` are the core's calibration. Raises `InputError` if a part or the core is unknown, or the folder holds
-    something else.
+    figures do not depend on the engine. `regions` is the core's calibration. Raises `InputError` if a part or the core
+    is unknown, or the folder holds something else.
     """
     if not core.strip():
         raise InputError('--core: is empty; must be an installed estimator, or a command as in "command: ./core"')

@@ -57,6 +57,21 @@ def named_path(_: Any, tokens: Sequence[Token]) -> Path:
     return Path(tokens[0].value)
 
 
+def numbers(_: Any, tokens: Sequence[Token]) -> tuple[float, ...]:
+    """Convert an option to numbers separated by commas."""
+    try:
+        return tuple(float(part) for part in tokens[0].value.split(","))
+    except ValueError:
+        raise ValueError(f"{tokens[0].value!r}: must be numbers separated by commas, such as 20,60") from None
+
+
+def both(distances: tuple[float, ...]) -> tuple[float, float]:
+    """Return the ends of --distances; raise `InputError` unless there are two."""
+    if len(distances) != 2:
+        raise InputError(f"--distances: {len(distances)} numbers; must be two, the nearest and the farthest, mm")
+    return distances[0], distances[1]
+
+
 Names = str | tuple[str, ...] | None
 """Of an option, where they are not the argument's."""
 
@@ -157,6 +172,17 @@ Estimators = Annotated[
         negative="",
         help="Estimator by name, a network of your own, learned_spot:FILE.onnx, or a core of your own: "
         "'command: PROGRAM ARGUMENT...' or FILE.toml; may be repeated.",
+    ),
+]
+DISTANCES_MM = (20.0, 60.0)
+Distances = Annotated[
+    tuple[float, ...],
+    Parameter(
+        help="Nearest and farthest distance of the wall, mm: 20,60.",
+        negative="",
+        converter=numbers,
+        n_tokens=1,
+        allow_leading_hyphen=True,
     ),
 ]
 Out = Annotated[Path, path("Folder for the results; made if need be.", OUT)]

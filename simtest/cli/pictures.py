@@ -10,9 +10,13 @@ from cyclopts import App, Parameter
 from simtest.api import Extras, reconstruct_picture
 from simtest.cli.common import (
     DEFAULTS,
+    DISTANCES_MM,
     MOST_ROWS,
     NO_REGIONS,
+    ONE_PROCESS,
     OUT,
+    Distances,
+    EngineOptions,
     NamedPath,
     Out,
     PictureOptions,
@@ -21,11 +25,13 @@ from simtest.cli.common import (
     Table,
     Told,
     about,
+    both,
     command,
     command_line,
     counted,
     few,
     fixed,
+    flag,
     path,
     whole,
 )
@@ -318,7 +324,55 @@ def _twin_cells(each: "SpotTwins") -> list[str]:
     ]  # fmt: skip
 
 
-calibrate = App(name="calibrate", help="Measure what a calibration file states: the positions of the lights.")
+calibrate = App(name="calibrate", help="Measure where the lights are, or how far off a core's normals are.")
+
+
+@calibrate.command(name="core")
+@command
+def core_(
+    core: str,
+    /,
+    *,
+    scope: Annotated[
+        str, about("A scope file (TOML), or a preset: colocated, colonoscope_2, colonoscope_3, laparoscope.")
+    ],
+    out: Annotated[Path, path("File of the calibration, JSON; answers to the frames stay in a folder beside it.", OUT)],
+    organ: Annotated[
+        Literal["colon", "stomach", "liver", "gallbladder", "plane"], about("Organ whose walls are rendered.")
+    ] = "colon",
+    distances: Distances = DISTANCES_MM,
+    highlights: Annotated[int, whole("Answers that the calibration stands on, at least.")] = 2400,
+    detector: Annotated[
+        Literal["colour", "peaks"],
+        about("How highlights are found: colour as by reconstruct in pictures, peaks as by validate."),
+    ] = "colour",
+    every: Annotated[bool, flag("Take highlights that are not isolated too.", "--all")] = False,
+    seed: Seed = None,
+    engine: EngineOptions = ONE_PROCESS,
+) -> Told:
+    """Find how far off a core's normals are, on rendered frames of your scope; a stopped calibration goes on.
+
+    reconstruct, validate, score and bench take the file as --regions.
+
+    Parameters
+    ----------
+    core : str
+        An installed estimator, 'command: PROGRAM ARGUMENT...' or FILE.toml, as --estimator takes it.
+    """
+    from simtest.advice.core_calibration import calibrate_core
+    from simtest.advice.plan import Question
+    from simtest.advice.scope import read_scope
+
+    question = Question(read_scope(scope), organ, both(distances), seed=seed or 0)
+    with exclusive_file(out), progress_bar() as progress:
+        made = calibrate_core(core, question, out, highlights, detector, every, engine.make(), progress)
+    rows = [
+        (target, each.text, str(each.highlights), str(each.frames), *(f"{value:.3g}" for value in each.error_deg))
+        for target, strata in made.strata.items()
+        for each in strata
+    ]
+    heads = ("normal of", "stratum", "answers", "frames", "68 % within (deg)", "95 % within (deg)")
+    return Told([out], made.model_dump(mode="json"), [Table(heads, rows)])
 
 
 @calibrate.command

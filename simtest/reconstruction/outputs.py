@@ -67,9 +67,7 @@ def columns_of(entries: Sequence[JsonObject]) -> tuple[str, ...]:
     return (*COLUMNS, *REGION_COLUMNS) if held else COLUMNS
 
 
-def normals_rows(
-    entries: Iterable[JsonObject], columns: Sequence[str] = COLUMNS
-) -> Iterator[tuple[object, ...]]:
+def normals_rows(entries: Iterable[JsonObject], columns: Sequence[str] = COLUMNS) -> Iterator[tuple[object, ...]]:
     """Yield a row of the columns for each entry of ``specularities``, estimator and candidate; 0 is the proposed one.
 
     The columns are `COLUMNS`, and any keys of estimates behind them.

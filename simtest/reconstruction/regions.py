@@ -31,10 +31,10 @@ from simtest.spec.spec_model import Spec, validate
 if TYPE_CHECKING:
     from simtest.reconstruction.records import Specularity
 
-FORMAT = "simtest core calibration, version 1"
+Format = Literal["simtest core calibration, version 1"]
 LEVELS = (0.68, 0.95)
 
-Feature = Literal["sigma_deg", "score", "radius_px", "border", "flags", "kind"]
+Feature = Literal["sigma_deg", "axis_ratio", "score", "radius_px", "border", "flags", "kind"]
 
 MOST_DEG = 180.0
 """No direction is farther off."""
@@ -56,12 +56,20 @@ class Stratum(Spec):
     error_deg: Radii
     ratio: Radii | None = Field(description="over the reported standard deviation; None where not all report one")
 
-    def holds(self, seen: Mapping[str, float]) -> bool:
+    def holds(self, seen: Mapping[Feature, float]) -> bool:
         """Return whether an answer with these features belongs to it."""
         return all(
             (low is None or seen[name] >= low) and (high is None or seen[name] < high)
             for name, (low, high) in self.ends.items()
         )
+
+    @property
+    def text(self) -> str:
+        """Its ends in words."""
+        told = []
+        for name, (low, high) in self.ends.items():
+            told += [f"{name} >= {low:.3g}"] * (low is not None) + [f"{name} < {high:.3g}"] * (high is not None)
+        return ", ".join(told) or "all"
 
     def radii(self, sigma_deg: float) -> Radii:
         """Return the region of an answer in it, deg; `sigma_deg` is -1 where the core reports none."""
@@ -91,7 +99,7 @@ class Shift(Spec):
 class CoreCalibration(Spec):
     """What was found of a core on frames of a scope."""
 
-    format: Literal["simtest core calibration, version 1"] = FORMAT
+    format: Format = "simtest core calibration, version 1"
     core: str = Field(min_length=1, description="its name in results")
     scope: str
     organ: str
@@ -110,15 +118,15 @@ class CoreCalibration(Spec):
         if size != self.size:
             return f"{size[0]} x {size[1]} px, not {self.size[0]} x {self.size[1]}"
         if (choices.detector, every) != (self.detector, self.every):
-            of = {True: "all highlights", False: "isolated highlights"}
-            return f"{of[every]} found by {choices.detector}, not {of[self.every]} by {self.detector}"
+            of = {True: "all", False: "isolated"}
+            return f"searched for {of[every]} highlights by {choices.detector}, not {of[self.every]} by {self.detector}"
         if self.shift is None:
             return ""
         statistics = statistics_of(image)
         distance = math.inf if statistics is None else self.shift.distance(statistics)
         return f"{distance:.3g} standard deviations off" if distance > self.shift.limit else ""
 
-    def region(self, seen: Mapping[str, float], target: Target, outside: str) -> CalibratedRegion | None:
+    def region(self, seen: Mapping[Feature, float], target: Target, outside: str) -> CalibratedRegion | None:
         """Return the region of an answer with these features; None where its surface's normal was not calibrated.
 
         In a frame that is `outside` it is that of the worst stratum: the largest ratio to the reported deviation, and
@@ -130,7 +138,8 @@ class CoreCalibration(Spec):
         if outside:
             radii = [each.radii(deviation) for each in strata for deviation in (sigma, -1.0)]
             first, last = (max(each) for each in zip(*radii, strict=True))
-            return CalibratedRegion(first, last, f"the worst of {self.highlights} highlights of {self.scope}: {outside}")
+            source = f"the worst of {self.highlights} highlights of {self.scope}, as the frame is {outside}"
+            return CalibratedRegion(first, last, source)
         own = next((each for each in strata if each.holds(seen)), None)
         if own is None:
             return None
@@ -175,17 +184,17 @@ def with_regions(
             f"{', '.join(choices.estimators) or 'none'}"
         )
     outside = {name: own.outside(image, choices, options.every) for name, own in files.items()}
-    size = image.shape[1], image.shape[0]
+    size, most = (image.shape[1], image.shape[0]), regions.refuse_above_deg or math.inf
 
     def judged(spot: "Specularity", name: str, estimate: Estimate) -> Estimate | Failure:
         if name not in files:
             return estimate
         if outside[name] and regions.shifted == "refuse":
-            return Failure(Reason.REFUSED, f"the frame is unlike those of the calibration: {outside[name]}")
+            return Failure(Reason.REFUSED, f"the frame is unlike those of the calibration: it is {outside[name]}")
         found = files[name].region(features(spot, estimate, size), estimate.target, outside[name])
-        if found is not None and regions.refuse_above_deg is not None and found.radius_95_deg > regions.refuse_above_deg:
-            over = f"{found.radius_95_deg:.3g} deg, above {regions.refuse_above_deg:g}"
-            return Failure(Reason.REFUSED, f"its calibrated 95 % radius is {over}")
+        if found is not None and found.radius_95_deg > most:
+            reached = f"{found.radius_95_deg:.3g} deg, above {most:g}"
+            return Failure(Reason.REFUSED, f"its calibrated 95 % radius is {reached}")
         return estimate if found is None else replace(estimate, calibrated=found)
 
     made = []
@@ -194,9 +203,10 @@ def with_regions(
             name: judged(spot, name, result) if isinstance(result, Estimate) else result
             for name, result in spot.estimates.items()
         }
-        organ = {name: judged(spot, name, each) for name, each in spot.organ.items()}
-        kept = {name: each for name, each in organ.items() if isinstance(each, Estimate)}
-        made.append(replace(spot, estimates=given, organ=kept))
+        organ = {name: (judged(spot, name, each), each) for name, each in spot.organ.items()}
+        # The best estimate's stays, with its own uncertainty.
+        stays = {name: new if isinstance(new, Estimate) else old for name, (new, old) in organ.items()}
+        made.append(replace(spot, estimates=given, organ=stays))
     return made
 
 
@@ -207,17 +217,18 @@ def statistics_of(image: Image) -> Array | None:
     return summarise(measure(np.asarray(image, np.float32)))
 
 
-def features(spot: "Specularity", estimate: Estimate, size: tuple[int, int]) -> dict[str, float]:
+def features(spot: "Specularity", estimate: Estimate, size: tuple[int, int]) -> dict[Feature, float]:
     """Return what strata are made by: all of it can be seen without the truth.
 
-    They are the reported standard deviation, deg, -1 where there is none; the detection's score, -1 likewise; the
-    radius at half height, px; the peak's distance to the frame's border over the frame's width; the number of flags;
-    the number of the kind, -1 where the detector tells none.
+    They are the reported standard deviation, deg, the estimate's axis ratio and the detection's score, -1 where there
+    is none; the radius at half height, px; the peak's distance to the frame's border over its width; the number of
+    flags; the number of the kind, -1 where the detector tells none.
     """
     patch, (x, y), (width, height) = spot.patch, spot.position_px, size
     area = 0.0 if isinstance(patch, Failure) else float(np.count_nonzero(patch.inside(HIGHLIGHT_ISOVALUE, cut=True)))
     return {
         "sigma_deg": -1.0 if estimate.deviation_deg is None else estimate.deviation_deg,
+        "axis_ratio": -1.0 if estimate.axis_ratio is None else estimate.axis_ratio,
         "score": -1.0 if spot.score is None else spot.score,
         "radius_px": math.sqrt(area / math.pi),
         "border": max(float(min(x, y, width - x, height - y)), 0.0) / width,

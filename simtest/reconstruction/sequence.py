@@ -302,7 +302,7 @@ def _read_done(path: Path, name: str) -> JsonObject | None:
     try:
         entry: JsonObject = read_json(path)
         # The tables, the tracks and the motion need what a frame's file must hold.
-        tuple(_rows(entry))
+        tuple(_rows(entry, COLUMNS))
         np.asarray(_positions(entry), dtype=float).reshape(-1, 2)
         for spot in entry["specularities"]:
             TrackedHighlight.from_json(0, spot)
@@ -361,7 +361,9 @@ def _told_by_motion(judged: Sequence[MotionRecord], poses: Poses, is_flipped: bo
 
 def _settings(source: Path, options: Options, calibration: Calibration | None) -> JsonObject:
     """Return the run's settings, through JSON, so that paths and tuples compare with the text and lists of a file."""
-    given = {key: value for key, value in asdict(options).items() if key not in ("poses", "regions") or value is not None}
+    given = {
+        key: value for key, value in asdict(options).items() if key not in ("poses", "regions") or value is not None
+    }
     if calibration is not None:
         content = json.dumps(asdict(calibration), default=str)
         given["calibration"] = hashlib.sha256(content.encode()).hexdigest()
