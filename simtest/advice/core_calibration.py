@@ -27,11 +27,16 @@ from simtest.reconstruction.records import Specularity
 from simtest.reconstruction.regions import (
     LEVELS,
     MOST_DEG,
+    REGRESSORS,
     CoreCalibration,
+    Expected,
     Feature,
     Shift,
+    Strata,
     Stratum,
     features,
+    regressors,
+    scales,
     statistics_of,
 )
 from simtest.runtime import provenance
@@ -44,16 +49,21 @@ from simtest.validation.columns import Row
 from simtest.validation.realisation import answer, score
 from simtest.validation.runner import Progress, variant_of
 
-BATCHES = 8
-"""Frames of so many batches at least, `DISTANCES` frames each: fewer tell no quantile of 95 %."""
+BATCHES = 16
+"""Of `DISTANCES` frames each, at least: with few frames a region must be wide, however many answers they hold."""
 
 MOST_BATCHES = 500
 
-LEAST_HIGHLIGHTS, LEAST_FRAMES = 100, 30
+LEAST_HIGHLIGHTS, LEAST_FRAMES = 100, 50
 """A stratum stands on so many answers in so many frames, or is no stratum of its own."""
 
-ORDER: tuple[Feature, ...] = ("sigma_deg", "axis_ratio", "score", "radius_px", "flags", "border", "kind")
-"""In which strata are parted, each at the median of what is left."""
+ORDER: tuple[Feature, ...] = ("sigma_deg", "score", "flags", "radius_px", "border", "axis_ratio", "kind")
+"""In which strata are parted."""
+
+FOLDS = 10
+
+RIDGE = 0.05
+"""Of the expected error's weights, over the variance of a regressor."""
 
 FALSE_ALARMS = 0.05
 SHRINKAGE = 0.1
@@ -131,8 +141,8 @@ def answers_of(
             tissue = at.valid[i] and (metal is None or not metal[y, x])
             normal = (at.normal if estimate.target == "fine" else at.normal_base)[i]
             error = float(angle_deg(estimate.normal, normal)) if tissue else MOST_DEG
-        seen: JsonObject = {**features(spot, estimate, (width, height))}
-        made.append({**seen, "target": estimate.target, "error_deg": error, "is_true": row["true_id"] is not None})
+        told_of: JsonObject = {"estimator": row["estimator"], "target": estimate.target, "error_deg": error}
+        made.append({**told_of, **features(spot, estimate, (width, height))})  # type: ignore[dict-item]
     return made
 
 
@@ -146,14 +156,55 @@ def quantile(values: Array, frames: IntArray, level: float) -> float:
     return float(np.sort(values)[rank - 1]) if rank <= len(values) else math.inf
 
 
-def strata_of(seen: Mapping[Feature, Array], error_deg: Array, frames: IntArray) -> tuple[Stratum, ...]:
-    """Part answers into strata by their features, shape (N,) each, and find the quantiles of their errors.
+def strata_of(seen: Mapping[Feature, Array], error_deg: Array, frames: IntArray) -> Strata:
+    """Find the scale of answers' errors, and the quantiles of these over it in strata; features of shape (N,) each.
 
-    The cuts are medians of what is seen: they do not depend on the errors.
+    The scale is the one with the least mean interval score in all. What is expected of an answer for that, and for the
+    quantiles, comes from the other batches' frames.
     """
-    everything = np.arange(len(error_deg))
-    parts = _parted(seen, frames, everything, {}, ORDER)
-    return tuple(_stratum(seen["sigma_deg"][own], error_deg[own], frames[own], ends) for own, ends in parts)
+    fold = frames // DISTANCES % FOLDS
+    others = np.ones(len(frames))
+    for each in np.unique(fold):
+        own = fold == each
+        kept, held = ({name: values[which] for name, values in seen.items()} for which in (~own, own))
+        others[own] = expected_of(kept, error_deg[~own], frames[~own]).of(held)
+    expected = expected_of(seen, error_deg, frames)
+    known = {**scales(seen, expected), "expected": others}
+
+    def mean_score(scale: Array) -> float:
+        return float(interval_scores(scale * quantile(error_deg / scale, frames, LEVELS[1]), error_deg).mean())
+
+    usable = [kind for kind, values in known.items() if np.isfinite(values).all()]
+    scale = min(usable, key=lambda kind: mean_score(known[kind]))
+    ratios, parts = error_deg / known[scale], []
+    for own, ends in _parted(seen, frames, np.arange(len(frames)), {}, ORDER):
+        of = frames[own]
+        first, last = (tuple(quantile(each[own], of, level) for level in LEVELS) for each in (ratios, error_deg))
+        parts.append(Stratum(ends=ends, highlights=len(own), frames=len(np.unique(of)), ratio=first, error_deg=last))
+    return Strata(scale=scale, expected=expected, parts=tuple(parts))
+
+
+def interval_scores(radius_deg: Array, error_deg: Array) -> Array:
+    """Return what regions of 95 % are judged by, the less the better: the radius, and by how much it is exceeded."""
+    return np.asarray(radius_deg + np.maximum(error_deg - radius_deg, 0) / (1 - LEVELS[1]))
+
+
+def expected_of(seen: Mapping[Feature, Array], error_deg: Array, frames: IntArray) -> Expected:
+    """Fit the error that is expected of an answer by its features (ridge regression).
+
+    The logarithm is that of the error and the median error, as errors near 0 are chance. Frames weigh by the root of
+    the number of their answers.
+    """
+    rows = regressors(seen)
+    _, which, counts = np.unique(frames, return_inverse=True, return_counts=True)
+    weights = 1 / np.sqrt(counts[which])
+    weights /= weights.sum()
+    target = np.log(error_deg + np.median(error_deg))
+    centre, spread, start = weights @ rows, rows.std(axis=0) + 1e-9, weights @ target
+    scaled = np.clip((rows - centre) / spread, -3, 3)
+    normal = (scaled * weights[:, None]).T @ scaled + RIDGE * np.eye(REGRESSORS)
+    found = np.linalg.solve(normal, (scaled * weights[:, None]).T @ (target - start))
+    return Expected(centre=tuple(centre), spread=tuple(spread), weights=tuple(found), start=float(start))
 
 
 Ends = dict[Feature, tuple[float | None, float | None]]
@@ -162,7 +213,10 @@ Ends = dict[Feature, tuple[float | None, float | None]]
 def _parted(
     seen: Mapping[Feature, Array], frames: IntArray, own: IntArray, ends: Ends, order: Sequence[Feature]
 ) -> list[tuple[IntArray, Ends]]:
-    """Part answers, given by their indices, at each feature in turn where both halves are large enough."""
+    """Part answers, given by their indices, at the median of each feature in turn where both halves are large enough.
+
+    The cuts do not depend on the errors.
+    """
     for i, name in enumerate(order):
         values = seen[name][own]
         cut = float(np.median(values))
@@ -172,23 +226,9 @@ def _parted(
         halves = own[values < cut], own[values >= cut]
         if all(len(half) >= LEAST_HIGHLIGHTS and len(np.unique(frames[half])) >= LEAST_FRAMES for half in halves):
             low, high = ends.get(name, (None, None))
-            sides = zip(halves, ((low, cut), (cut, high)), strict=True)
-            return [
-                part
-                for half, side in sides
-                for part in _parted(seen, frames, half, ends | {name: side}, order[i + 1 :])
-            ]
+            first = _parted(seen, frames, halves[0], {**ends, name: (low, cut)}, order[i + 1 :])
+            return first + _parted(seen, frames, halves[1], {**ends, name: (cut, high)}, order[i + 1 :])
     return [(own, ends)]
-
-
-def _stratum(sigma_deg: Array, error_deg: Array, frames: IntArray, ends: Ends) -> Stratum:
-    def radii(values: Array) -> tuple[float, float]:
-        first, last = (quantile(values, frames, level) for level in LEVELS)
-        return first, last
-
-    ratio = radii(error_deg / sigma_deg) if np.all(sigma_deg > 0) else None
-    count = len(np.unique(frames))
-    return Stratum(ends=ends, highlights=len(error_deg), frames=count, error_deg=radii(error_deg), ratio=ratio)
 
 
 def shift_of(statistics: Array) -> Shift:
@@ -253,7 +293,7 @@ def calibrate_core(
     try:
         while (wanted := _batches(frames, highlights, name)) * DISTANCES > len(frames):
             batches = [
-                Batch(_drawn(question, number), absolute, detector, every, folder / f"{number:04d}.json")
+                Batch(batch_question(question, number), absolute, detector, every, folder / f"{number:04d}.json")
                 for number in range(wanted)
             ]
             _make(batches, chosen, progress)
@@ -265,7 +305,7 @@ def calibrate_core(
     return calibration
 
 
-def _drawn(question: Question, number: int) -> Question:
+def batch_question(question: Question, number: int) -> Question:
     """Return the question of a batch: a frame at each distance, of a seed of its own."""
     seed = integer(question.seed, "calibrate core", "batch", number, Stage.SWEEP)
     return replace(question, frames=DISTANCES, seed=seed)
@@ -329,7 +369,7 @@ def calibration_of(
     name: str, frames: Sequence[JsonObject], question: Question, detector: str, every: bool, settings: JsonObject
 ) -> CoreCalibration:
     """Return the calibration by the answers to frames."""
-    strata: dict[Target, tuple[Stratum, ...]] = {}
+    strata: dict[Target, Strata] = {}
     numbered = [(i, each) for i, frame in enumerate(frames) for each in frame["answers"]]
     for target in ("fine", "base"):
         own = [(i, each) for i, each in numbered if each["target"] == target]
@@ -341,7 +381,7 @@ def calibration_of(
     scope = question.scope
     return CoreCalibration(
         core=name, scope=scope.name, organ=question.organ, size=scope.size, detector=detector, every=every,
-        highlights=max(sum(each.highlights for each in own) for own in strata.values()), frames=len(frames),
+        highlights=max(sum(each.highlights for each in own.parts) for own in strata.values()), frames=len(frames),
         strata=strata, shift=None if None in told else shift_of(np.array(told, float)),
         made={**settings, **provenance.environment()},
     )  # fmt: skip

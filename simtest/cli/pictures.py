@@ -369,7 +369,7 @@ def core_(
     rows = [
         (target, each.text, str(each.highlights), str(each.frames), *(f"{value:.3g}" for value in each.error_deg))
         for target, strata in made.strata.items()
-        for each in strata
+        for each in strata.parts
     ]
     heads = ("normal of", "stratum", "answers", "frames", "68 % within (deg)", "95 % within (deg)")
     return Told([out], made.model_dump(mode="json"), [Table(heads, rows)])

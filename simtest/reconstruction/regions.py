@@ -2,8 +2,8 @@
 
 `simtest calibrate core` writes the file (`simtest.advice.core_calibration`). It parts the answers into strata by what
 can be seen without the truth, and states of each how large the errors of 68 and 95 % of the answers were at most, over
-the standard deviation that the core reports, or in deg where it reports none. Frames unlike those of the calibration,
-by the statistics that realism is measured by, get the region of the worst stratum, or none.
+a scale: the standard deviation that the core reports, its root, or what is expected of such a highlight. Frames unlike
+those of the calibration, by the statistics that realism is measured by, get the region of the worst stratum, or none.
 """
 
 import math
@@ -36,6 +36,8 @@ LEVELS = (0.68, 0.95)
 
 Feature = Literal["sigma_deg", "axis_ratio", "score", "radius_px", "border", "flags", "kind"]
 
+REGRESSORS = 11
+
 MOST_DEG = 180.0
 """No direction is farther off."""
 
@@ -44,7 +46,35 @@ Positive = Annotated[float, Field(ge=0)]
 Radii = tuple[Positive, Positive]
 """At 68 and at 95 %."""
 
+Numbers = Annotated[tuple[float, ...], Field(min_length=REGRESSORS, max_length=REGRESSORS)]
+ScaleKind = Literal["one", "reported", "root", "expected"]
+Seen = Mapping[Feature, float] | Mapping[Feature, Array]
+"""Features of an answer, or of several."""
+
 # The file -------------------------------------------------------------------------------------------------------------
+
+
+class Expected(Spec):
+    """The error that is expected of an answer by its features: the exponential of a linear form of `regressors`."""
+
+    centre: Numbers
+    spread: Numbers
+    weights: Numbers = Field(description="of the regressors less the centre, over the spread, within 3 of them")
+    start: float
+
+    def of(self, seen: Seen) -> Array:
+        """Return it for answers with these features, deg."""
+        scaled = (regressors(seen) - np.array(self.centre)) / np.array(self.spread)
+        return np.asarray(np.exp(self.start + np.clip(scaled, -3, 3) @ np.array(self.weights)))
+
+
+def regressors(seen: Seen) -> Array:
+    """Return what the expected error depends on, shape (..., R)."""
+    sigma, ratio, score, radius = (np.asarray(seen[each]) for each in ("sigma_deg", "axis_ratio", "score", "radius_px"))
+    reported = np.where(sigma > 0, np.log(np.maximum(sigma, 0.01)), 0.0)
+    bent = np.stack([reported, score, np.log(np.maximum(radius, 0.5)), ratio], axis=-1)
+    others = np.stack([ratio < 0, np.asarray(seen["flags"]), np.minimum(seen["border"], 0.2)], axis=-1)
+    return np.concatenate([bent, bent**2, others], axis=-1)
 
 
 class Stratum(Spec):
@@ -53,8 +83,8 @@ class Stratum(Spec):
     ends: dict[Feature, tuple[float | None, float | None]] = Field(description="of its features: at least, and below")
     highlights: int = Field(ge=1, description="it stands on")
     frames: int = Field(ge=1, description="that these are of")
+    ratio: Radii = Field(description="errors over the scale")
     error_deg: Radii
-    ratio: Radii | None = Field(description="over the reported standard deviation; None where not all report one")
 
     def holds(self, seen: Mapping[Feature, float]) -> bool:
         """Return whether an answer with these features belongs to it."""
@@ -71,10 +101,36 @@ class Stratum(Spec):
             told += [f"{name} >= {low:.3g}"] * (low is not None) + [f"{name} < {high:.3g}"] * (high is not None)
         return ", ".join(told) or "all"
 
-    def radii(self, sigma_deg: float) -> Radii:
-        """Return the region of an answer in it, deg; `sigma_deg` is -1 where the core reports none."""
-        scale, (first, last) = (1.0, self.error_deg) if self.ratio is None or sigma_deg < 0 else (sigma_deg, self.ratio)
-        return min(scale * first, MOST_DEG), min(scale * last, MOST_DEG)
+
+class Strata(Spec):
+    """What was found of the normals of one surface."""
+
+    scale: ScaleKind = Field(description="over which errors are alike: one, reported deviation, its root, or expected")
+    expected: Expected
+    parts: tuple[Stratum, ...] = Field(min_length=1)
+
+    def region(self, seen: Mapping[Feature, float], outside: bool) -> tuple[Radii, int]:
+        """Return the region of an answer, deg, and how many answers it stands on.
+
+        Outside of the calibration, or without the deviation that the scale is of, it is that of the worst part.
+        """
+        scale = float(scales(seen, self.expected)[self.scale])
+        own = [each for each in self.parts if each.holds(seen)]
+        if outside or not own or not scale > 0:
+            held = [each.error_deg for each in self.parts]
+            held += [(scale * each.ratio[0], scale * each.ratio[1]) for each in self.parts if scale > 0]
+            first, last = max(each for each, _ in held), max(each for _, each in held)
+            return (min(first, MOST_DEG), min(last, MOST_DEG)), sum(each.highlights for each in self.parts)
+        first, last = own[0].ratio
+        return (min(scale * first, MOST_DEG), min(scale * last, MOST_DEG)), own[0].highlights
+
+
+def scales(seen: Seen, expected: Expected) -> dict[ScaleKind, Array]:
+    """Return the scales that errors may be divided by, by name; NaN where the core reports no deviation."""
+    sigma = np.asarray(seen["sigma_deg"], dtype=float)
+    reported = np.where(sigma > 0, sigma, np.nan)
+    one = np.ones_like(sigma)
+    return {"one": one, "reported": reported, "root": np.sqrt(reported), "expected": expected.of(seen)}
 
 
 class Shift(Spec):
@@ -108,7 +164,7 @@ class CoreCalibration(Spec):
     every: bool = Field(description="whether highlights were taken that are not isolated")
     highlights: int = Field(ge=1, description="answers in all")
     frames: int = Field(ge=1, description="that these are of")
-    strata: dict[Target, tuple[Stratum, ...]] = Field(min_length=1, description="by the surface whose normal is stated")
+    strata: dict[Target, Strata] = Field(min_length=1, description="by the surface whose normal is stated")
     shift: Shift | None = Field(description="None where the frames are grey")
     made: dict[str, JsonValue] = Field(description="of what, and with which versions")
 
@@ -127,24 +183,14 @@ class CoreCalibration(Spec):
         return f"{distance:.3g} standard deviations off" if distance > self.shift.limit else ""
 
     def region(self, seen: Mapping[Feature, float], target: Target, outside: str) -> CalibratedRegion | None:
-        """Return the region of an answer with these features; None where its surface's normal was not calibrated.
-
-        In a frame that is `outside` it is that of the worst stratum: the largest ratio to the reported deviation, and
-        no less than the largest error.
-        """
-        strata, sigma = self.strata.get(target, ()), seen["sigma_deg"]
-        if not strata:
+        """Return the region of an answer with these features; None where its surface's normal was not calibrated."""
+        if (strata := self.strata.get(target)) is None:
             return None
+        (first, last), count = strata.region(seen, bool(outside))
+        source = f"calibrated on {count} highlights of {self.scope}"
         if outside:
-            radii = [each.radii(deviation) for each in strata for deviation in (sigma, -1.0)]
-            first, last = (max(each) for each in zip(*radii, strict=True))
-            source = f"the worst of {self.highlights} highlights of {self.scope}, as the frame is {outside}"
-            return CalibratedRegion(first, last, source)
-        own = next((each for each in strata if each.holds(seen)), None)
-        if own is None:
-            return None
-        source = f"calibrated on {self.highlights} highlights of {self.scope}, {own.highlights} like this one"
-        return CalibratedRegion(*own.radii(sigma), source)
+            source = f"the worst of {count} highlights of {self.scope}, as the frame is {outside}"
+        return CalibratedRegion(first, last, source)
 
 
 @lru_cache(maxsize=8)
