@@ -3,7 +3,7 @@
     python -m studies.core_regions FOLDER [--scope colocated] [--batches 26] [--shifted 6] [--like peaks] [--workers 2]
 
 All cores answer to the same frames of the scope: `--batches` of 8 frames to calibrate on, as many of another seed to
-judge on, and `--shifted` batches each of another organ, of doubled relief, of lights that lie 1 mm from where they are
+judge on, and `--shifted` batches each of another organ, of a steeper relief, of lights 1 mm from where they are
 told, and of coarser coding. The answers stay in FOLDER, and a stopped study goes on. Printed are
 
 1. the coverage of the regions of 68 and 95 %, with the frame as the unit; the strata whose coverage is below 90 %
@@ -27,12 +27,12 @@ import numpy as np
 
 from benchmarks.measuring import print_markdown
 from simtest.advice import core_calibration, plan
-from simtest.advice.core_calibration import answers_of, interval_scores, quantile, shift_of, strata_of
+from simtest.advice.core_calibration import interval_scores, kept_frame, quantile, shift_of, strata_of
 from simtest.advice.plan import Question, main_experiment
 from simtest.advice.scope import read_scope
 from simtest.dataset.scoring.frames import CaseFrames, RenderedFrame
 from simtest.estimators import load_estimators
-from simtest.reconstruction.regions import Strata, statistics_of
+from simtest.reconstruction.regions import Strata, Stratum
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import write_json
 from simtest.runtime.processes import OnStep, make_engine
@@ -43,8 +43,10 @@ from simtest.validation.cases import expand
 OWN = ("circle_pose", "brightest_point", "cone_axis", "curved", "bisector", "photometric")
 CORES = (*OWN, "learned_spot", "command: python examples/cores/python/core.py")
 SEEDS = {"calibration": 1, "fresh": 2}
-SHIFTED = ("other organ", "doubled relief", "light moved", "coarser coding")
+SHIFTED = ("other organ", "steeper relief", "light moved", "coarser coding")
 MOVED_MM, QUALITY = 1.0, 40
+STEEPER = 1.75
+"""Twice would be a relief that is not allowed to the recipe's longest wavelengths."""
 ROUND = 1.7308
 """The 95 % quantile of the length of a round normal pair over the root of its covariance's trace."""
 
@@ -69,22 +71,21 @@ class Work:
         estimators, made = load_estimators(CORES), []
         for number, case in enumerate(expand(experiment)):
             for frame in CaseFrames(experiment, case, number, "llvm_ad_rgb"):
-                told = statistics_of(frame.image)
-                known = [float(v) if np.isfinite(v) else None for v in ([] if told is None else told)]
                 shown = told_wrongly(frame) if self.kind == "light moved" else frame
-                made.append({"statistics": known, "answers": answers_of(shown, estimators, self.like, True)})
+                made.append(kept_frame(shown, estimators, self.like, True))
         return made
 
     def changed(self, question: Question) -> Experiment:
         """Return the experiment of the batch with its shift."""
         around = plan.surroundings(question)
-        if self.kind == "doubled relief":
+        if self.kind == "steeper relief":
             doubled = copy.deepcopy(around)
             for n, band in enumerate(doubled.set["surface"]["relief"]["bands"]):
-                band["slope_deg"] = 2 * band["slope_deg"]
+                band["slope_deg"] = STEEPER * band["slope_deg"]
                 if (key := f"surface.relief.bands.{n}.slope_deg") in doubled.random:
-                    doubled.random[key] = tuple(2 * v for v in doubled.random[key])
-            plan.surroundings, kept = (lambda _: doubled), plan.surroundings
+                    low, high = doubled.random[key]
+                    doubled.random[key] = STEEPER * low, STEEPER * high
+            plan.surroundings, kept = (lambda question: doubled), plan.surroundings
             try:
                 return main_experiment(question)
             finally:
@@ -145,9 +146,18 @@ def judged(strata: Strata, held: Mapping[str, Array], outside: Array | None = No
     count = len(held["error_deg"])
     seen = [{name: float(held[name][i]) for name in core_calibration.ORDER} for i in range(count)]
     away = np.zeros(count, bool) if outside is None else outside[held["frame"]]
-    radii = np.array([strata.region(each, bool(off))[0] for each, off in zip(seen, away, strict=True)]).T
+    radii = np.array([strata.region(each, bool(off)) for each, off in zip(seen, away, strict=True)]).T
     stratum = np.array([next(n for n, part in enumerate(strata.parts) if part.holds(each)) for each in seen])
     return Judged(held["error_deg"], held["sigma_deg"], held["frame"], radii.reshape(2, -1), stratum)
+
+
+def text_of(part: Stratum) -> str:
+    """Return a stratum's ends in words."""
+    told = []
+    for name, (low, high) in part.ends.items():
+        told += [] if low is None else [f"{name} >= {low:.3g}"]
+        told += [] if high is None else [f"{name} < {high:.3g}"]
+    return ", ".join(told) or "all"
 
 
 def below(hits: Array, frames: Array, share: float) -> float:
@@ -161,7 +171,7 @@ def below(hits: Array, frames: Array, share: float) -> float:
 def covered(held: Judged, level: int) -> str:
     """Return the coverage with its 95 % interval, %."""
     hits = (held.error_deg <= held.radii_deg[level]).astype(float)
-    low, high = share_interval(hits, held.frames)
+    low, high = share_interval(hits, held.frames.astype(int))
     return f"{100 * hits.mean():.1f} ({100 * low:.0f} to {100 * high:.0f})"
 
 
@@ -191,7 +201,7 @@ def print_study(frames: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
             for n in range(len(strata.parts)):
                 own = met.stratum == n
                 if own.sum() and len(np.unique(met.frames[own])) > 4:
-                    chances.append((below(hits[own], met.frames[own], 0.9), core, target, strata.parts[n].text))
+                    chances.append((below(hits[own], met.frames[own], 0.9), core, target, text_of(strata.parts[n])))
                     shares.append(100 * hits[own].mean())
             first.append((core, target, f"{len(error)} / {len(met.error_deg)}", strata.scale, str(len(strata.parts)),
                           covered(met, 0), covered(met, 1), f"{min(shares):.0f}" if shares else "–",
@@ -203,7 +213,7 @@ def print_study(frames: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
                     shifted.append((core, target, kind, str(len(moved["error_deg"])), without, with_it))
             if np.all(sigma > 0):
                 factors += [
-                    (core, target, part.text, str(part.highlights), f"{quantile_ratio(held, part) / ROUND:.2f}")
+                    (core, target, text_of(part), str(part.highlights), f"{quantile_ratio(held, part) / ROUND:.2f}")
                     for part in strata.parts
                 ]
     heads = ("core", "normal", "answers, calibration / fresh", "scale", "strata", "68 %", "95 %", "least of a stratum",
@@ -216,7 +226,7 @@ def print_study(frames: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
     print_markdown([("core", "normal", "stratum", "answers", "factor"), *factors])
 
 
-def quantile_ratio(held: Mapping[str, Array], part: Any) -> float:
+def quantile_ratio(held: Mapping[str, Array], part: Stratum) -> float:
     """Return the 95 % quantile of errors over reported deviations in a stratum."""
     own = np.ones(len(held["error_deg"]), bool)
     for name, (low, high) in part.ends.items():

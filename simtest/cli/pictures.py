@@ -367,11 +367,11 @@ def core_(
     with exclusive_file(out), progress_bar() as progress:
         made = calibrate_core(core, question, out, highlights, detector, every, engine.make(), progress)
     rows = [
-        (target, each.text, str(each.highlights), str(each.frames), *(f"{value:.3g}" for value in each.error_deg))
+        (target, str(each.highlights), str(each.frames), *(f"{value:.3g}" for value in each.error_deg))
         for target, strata in made.strata.items()
         for each in strata.parts
     ]
-    heads = ("normal of", "stratum", "answers", "frames", "68 % within (deg)", "95 % within (deg)")
+    heads = ("normal of", "answers", "frames", "68 % within (deg)", "95 % within (deg)")
     return Told([out], made.model_dump(mode="json"), [Table(heads, rows)])
 
 

@@ -31,25 +31,55 @@ from simtest.spec.spec_model import Spec, validate
 if TYPE_CHECKING:
     from simtest.reconstruction.records import Specularity
 
-Format = Literal["simtest core calibration, version 1"]
 LEVELS = (0.68, 0.95)
-
-Feature = Literal["sigma_deg", "axis_ratio", "score", "radius_px", "border", "flags", "kind"]
-
-REGRESSORS = 11
-
 MOST_DEG = 180.0
 """No direction is farther off."""
 
-Positive = Annotated[float, Field(ge=0)]
+REGRESSORS = 11
 
+Format = Literal["simtest core calibration, version 1"]
+Feature = Literal["sigma_deg", "axis_ratio", "score", "radius_px", "border", "flags", "kind"]
+Ends = dict[Feature, tuple[float | None, float | None]]
+"""What features are at least, and below."""
+
+ScaleKind = Literal["one", "reported", "root", "expected"]
+Positive = Annotated[float, Field(ge=0)]
 Radii = tuple[Positive, Positive]
 """At 68 and at 95 %."""
 
 Numbers = Annotated[tuple[float, ...], Field(min_length=REGRESSORS, max_length=REGRESSORS)]
-ScaleKind = Literal["one", "reported", "root", "expected"]
 Seen = Mapping[Feature, float] | Mapping[Feature, Array]
 """Features of an answer, or of several."""
+
+
+def features(spot: "Specularity", estimate: Estimate, size: tuple[int, int]) -> dict[Feature, float]:
+    """Return what strata are made by: all of it can be seen without the truth.
+
+    They are the reported standard deviation, deg, the estimate's axis ratio and the detection's score, -1 where there
+    is none; the radius at half height, px; the peak's distance to the frame's border over its width; the number of
+    flags; the number of the kind, -1 where the detector tells none.
+    """
+    patch, (x, y), (width, height) = spot.patch, spot.position_px, size
+    area = 0.0 if isinstance(patch, Failure) else float(np.count_nonzero(patch.inside(HIGHLIGHT_ISOVALUE, cut=True)))
+    return {
+        "sigma_deg": -1.0 if estimate.deviation_deg is None else estimate.deviation_deg,
+        "axis_ratio": -1.0 if estimate.axis_ratio is None else estimate.axis_ratio,
+        "score": -1.0 if spot.score is None else spot.score,
+        "radius_px": math.sqrt(area / math.pi),
+        "border": max(float(min(x, y, width - x, height - y)), 0.0) / width,
+        "flags": float(len(estimate.flags)),
+        "kind": -1.0 if spot.kind is None else float([*Kind].index(Kind(spot.kind))),
+    }
+
+
+def regressors(seen: Seen) -> Array:
+    """Return what the expected error depends on, shape (..., R)."""
+    sigma, ratio, score, radius = (np.asarray(seen[each]) for each in ("sigma_deg", "axis_ratio", "score", "radius_px"))
+    reported = np.where(sigma > 0, np.log(np.maximum(sigma, 0.01)), 0.0)
+    bent = np.stack([reported, score, np.log(np.maximum(radius, 0.5)), ratio], axis=-1)
+    others = np.stack([ratio < 0, np.asarray(seen["flags"]), np.minimum(seen["border"], 0.2)], axis=-1)
+    return np.concatenate([bent, bent**2, others], axis=-1)
+
 
 # The file -------------------------------------------------------------------------------------------------------------
 
@@ -68,19 +98,10 @@ class Expected(Spec):
         return np.asarray(np.exp(self.start + np.clip(scaled, -3, 3) @ np.array(self.weights)))
 
 
-def regressors(seen: Seen) -> Array:
-    """Return what the expected error depends on, shape (..., R)."""
-    sigma, ratio, score, radius = (np.asarray(seen[each]) for each in ("sigma_deg", "axis_ratio", "score", "radius_px"))
-    reported = np.where(sigma > 0, np.log(np.maximum(sigma, 0.01)), 0.0)
-    bent = np.stack([reported, score, np.log(np.maximum(radius, 0.5)), ratio], axis=-1)
-    others = np.stack([ratio < 0, np.asarray(seen["flags"]), np.minimum(seen["border"], 0.2)], axis=-1)
-    return np.concatenate([bent, bent**2, others], axis=-1)
-
-
 class Stratum(Spec):
     """Answers that are alike by what can be seen, and how large the errors of 68 and 95 % of them are at most."""
 
-    ends: dict[Feature, tuple[float | None, float | None]] = Field(description="of its features: at least, and below")
+    ends: Ends
     highlights: int = Field(ge=1, description="it stands on")
     frames: int = Field(ge=1, description="that these are of")
     ratio: Radii = Field(description="errors over the scale")
@@ -93,14 +114,6 @@ class Stratum(Spec):
             for name, (low, high) in self.ends.items()
         )
 
-    @property
-    def text(self) -> str:
-        """Its ends in words."""
-        told = []
-        for name, (low, high) in self.ends.items():
-            told += [f"{name} >= {low:.3g}"] * (low is not None) + [f"{name} < {high:.3g}"] * (high is not None)
-        return ", ".join(told) or "all"
-
 
 class Strata(Spec):
     """What was found of the normals of one surface."""
@@ -109,8 +122,8 @@ class Strata(Spec):
     expected: Expected
     parts: tuple[Stratum, ...] = Field(min_length=1)
 
-    def region(self, seen: Mapping[Feature, float], outside: bool) -> tuple[Radii, int]:
-        """Return the region of an answer, deg, and how many answers it stands on.
+    def region(self, seen: Mapping[Feature, float], outside: bool) -> Radii:
+        """Return the region of an answer, deg.
 
         Outside of the calibration, or without the deviation that the scale is of, it is that of the worst part.
         """
@@ -119,18 +132,18 @@ class Strata(Spec):
         if outside or not own or not scale > 0:
             held = [each.error_deg for each in self.parts]
             held += [(scale * each.ratio[0], scale * each.ratio[1]) for each in self.parts if scale > 0]
-            first, last = max(each for each, _ in held), max(each for _, each in held)
-            return (min(first, MOST_DEG), min(last, MOST_DEG)), sum(each.highlights for each in self.parts)
-        first, last = own[0].ratio
-        return (min(scale * first, MOST_DEG), min(scale * last, MOST_DEG)), own[0].highlights
+        else:
+            held = [(scale * own[0].ratio[0], scale * own[0].ratio[1])]
+        return min(max(each for each, _ in held), MOST_DEG), min(max(each for _, each in held), MOST_DEG)
 
 
 def scales(seen: Seen, expected: Expected) -> dict[ScaleKind, Array]:
-    """Return the scales that errors may be divided by, by name; NaN where the core reports no deviation."""
+    """Return the scales that errors may be divided by; NaN where the core reports no deviation."""
     sigma = np.asarray(seen["sigma_deg"], dtype=float)
     reported = np.where(sigma > 0, sigma, np.nan)
-    one = np.ones_like(sigma)
-    return {"one": one, "reported": reported, "root": np.sqrt(reported), "expected": expected.of(seen)}
+    return {
+        "one": np.ones_like(sigma), "reported": reported, "root": np.sqrt(reported), "expected": expected.of(seen),
+    }  # fmt: skip
 
 
 class Shift(Spec):
@@ -158,7 +171,6 @@ class CoreCalibration(Spec):
     format: Format = "simtest core calibration, version 1"
     core: str = Field(min_length=1, description="its name in results")
     scope: str
-    organ: str
     size: tuple[int, int] = Field(description="of the frames, px")
     detector: Literal["colour", "peaks"]
     every: bool = Field(description="whether highlights were taken that are not isolated")
@@ -170,27 +182,17 @@ class CoreCalibration(Spec):
 
     def outside(self, image: Image, choices: Choices, every: bool) -> str:
         """Return in what a frame is unlike those of the calibration; empty where it is like them."""
-        size = image.shape[1], image.shape[0]
+        size, searched = (image.shape[1], image.shape[0]), (choices.detector, every)
         if size != self.size:
-            return f"{size[0]} x {size[1]} px, not {self.size[0]} x {self.size[1]}"
-        if (choices.detector, every) != (self.detector, self.every):
-            of = {True: "all", False: "isolated"}
-            return f"searched for {of[every]} highlights by {choices.detector}, not {of[self.every]} by {self.detector}"
+            return f"of {size[0]} x {size[1]} px, not {self.size[0]} x {self.size[1]}"
+        if searched != (self.detector, self.every):
+            (here, there) = (f"{'all' if e else 'isolated'} {d}" for d, e in (searched, (self.detector, self.every)))
+            return f"searched by another detector: {here}, not {there}"
         if self.shift is None:
             return ""
         statistics = statistics_of(image)
         distance = math.inf if statistics is None else self.shift.distance(statistics)
         return f"{distance:.3g} standard deviations off" if distance > self.shift.limit else ""
-
-    def region(self, seen: Mapping[Feature, float], target: Target, outside: str) -> CalibratedRegion | None:
-        """Return the region of an answer with these features; None where its surface's normal was not calibrated."""
-        if (strata := self.strata.get(target)) is None:
-            return None
-        (first, last), count = strata.region(seen, bool(outside))
-        source = f"calibrated on {count} highlights of {self.scope}"
-        if outside:
-            source = f"the worst of {count} highlights of {self.scope}, as the frame is {outside}"
-        return CalibratedRegion(first, last, source)
 
 
 @lru_cache(maxsize=8)
@@ -198,16 +200,12 @@ def _read(path: Path, _: float) -> CoreCalibration:
     return validate(CoreCalibration, read_json(path, "a calibration of simtest calibrate core"), str(path))
 
 
-def read_calibrations(files: Sequence[str | Path]) -> dict[str, CoreCalibration]:
+def read_calibrations(files: Sequence[str]) -> dict[str, CoreCalibration]:
     """Read the calibrations of cores, by the cores' names in results."""
-    made = dict[str, CoreCalibration]()
-    for file in map(Path, files):
-        if not file.is_file():
-            raise InputError(f"{file}: no such file; must be a calibration of simtest calibrate core")
-        read = _read(file, file.stat().st_mtime)
-        if read.core in made:
-            raise InputError(f"{file}: is of the core {read.core}, as another file; one must be given")
-        made[read.core] = read
+    paths = [Path(file) for file in files]
+    made = {own.core: own for own in (_read(each, each.stat().st_mtime if each.is_file() else 0.0) for each in paths)}
+    if len(made) < len(paths):
+        raise InputError(f"{', '.join(files)}: several files of one core; one must be given")
     return made
 
 
@@ -221,38 +219,35 @@ def with_regions(
 
     Raises `InputError` where none of the files is of an estimator that is run.
     """
-    regions = options.regions
-    assert regions is not None
-    files = read_calibrations(regions.files)
+    given = options.regions
+    assert given is not None
+    files = read_calibrations(given.files)
     if not files.keys() & {*choices.estimators}:
-        raise InputError(
-            f"{', '.join(map(str, regions.files))}: of {', '.join(files)}, which is not run; estimators: "
-            f"{', '.join(choices.estimators) or 'none'}"
-        )
+        run = ", ".join(choices.estimators)
+        raise InputError(f"{', '.join(given.files)}: of {', '.join(files)}; must be of an estimator that runs: {run}")
     outside = {name: own.outside(image, choices, options.every) for name, own in files.items()}
-    size, most = (image.shape[1], image.shape[0]), regions.refuse_above_deg or math.inf
+    size, most = (image.shape[1], image.shape[0]), given.refuse_above_deg or MOST_DEG
 
-    def judged(spot: "Specularity", name: str, estimate: Estimate) -> Estimate | Failure:
-        if name not in files:
+    def judged(spot: "Specularity", name: str, estimate: Estimate | Failure) -> Estimate | Failure:
+        if isinstance(estimate, Failure) or name not in files or estimate.target not in files[name].strata:
             return estimate
-        if outside[name] and regions.shifted == "refuse":
-            return Failure(Reason.REFUSED, f"the frame is unlike those of the calibration: it is {outside[name]}")
-        found = files[name].region(features(spot, estimate, size), estimate.target, outside[name])
-        if found is not None and found.radius_95_deg > most:
-            reached = f"{found.radius_95_deg:.3g} deg, above {most:g}"
-            return Failure(Reason.REFUSED, f"its calibrated 95 % radius is {reached}")
-        return estimate if found is None else replace(estimate, calibrated=found)
+        own, unlike = files[name], outside[name]
+        if unlike and given.shifted == "refuse":
+            return Failure(Reason.REFUSED, f"the frame is unlike those of the calibration: it is {unlike}")
+        first, last = own.strata[estimate.target].region(features(spot, estimate, size), bool(unlike))
+        if last > most:
+            return Failure(Reason.REFUSED, f"its calibrated 95 % radius is {last:.3g} deg, above {most:g}")
+        source = f"calibrated on {own.highlights} highlights of {own.scope}"
+        worst = f"; the worst of them, as the frame is {unlike}" if unlike else ""
+        return replace(estimate, calibrated=CalibratedRegion(first, last, source + worst))
 
     made = []
     for spot in spots:
-        given = {
-            name: judged(spot, name, result) if isinstance(result, Estimate) else result
-            for name, result in spot.estimates.items()
-        }
+        results = {name: judged(spot, name, each) for name, each in spot.estimates.items()}
         organ = {name: (judged(spot, name, each), each) for name, each in spot.organ.items()}
-        # The best estimate's stays, with its own uncertainty.
+        # An organ's normal has no failures: a refused one stays without a region.
         stays = {name: new if isinstance(new, Estimate) else old for name, (new, old) in organ.items()}
-        made.append(replace(spot, estimates=given, organ=stays))
+        made.append(replace(spot, estimates=results, organ=stays))
     return made
 
 
@@ -261,23 +256,3 @@ def statistics_of(image: Image) -> Array | None:
     if min(image.shape[:2]) < LEAST_SIDE or not is_coloured(image):
         return None
     return summarise(measure(np.asarray(image, np.float32)))
-
-
-def features(spot: "Specularity", estimate: Estimate, size: tuple[int, int]) -> dict[Feature, float]:
-    """Return what strata are made by: all of it can be seen without the truth.
-
-    They are the reported standard deviation, deg, the estimate's axis ratio and the detection's score, -1 where there
-    is none; the radius at half height, px; the peak's distance to the frame's border over its width; the number of
-    flags; the number of the kind, -1 where the detector tells none.
-    """
-    patch, (x, y), (width, height) = spot.patch, spot.position_px, size
-    area = 0.0 if isinstance(patch, Failure) else float(np.count_nonzero(patch.inside(HIGHLIGHT_ISOVALUE, cut=True)))
-    return {
-        "sigma_deg": -1.0 if estimate.deviation_deg is None else estimate.deviation_deg,
-        "axis_ratio": -1.0 if estimate.axis_ratio is None else estimate.axis_ratio,
-        "score": -1.0 if spot.score is None else spot.score,
-        "radius_px": math.sqrt(area / math.pi),
-        "border": max(float(min(x, y, width - x, height - y)), 0.0) / width,
-        "flags": float(len(estimate.flags)),
-        "kind": -1.0 if spot.kind is None else float([*Kind].index(Kind(spot.kind))),
-    }
