@@ -45,7 +45,7 @@ CORES = (*OWN, "learned_spot", "command: python examples/cores/python/core.py")
 SEEDS = {"calibration": 1, "fresh": 2}
 SHIFTED = ("other organ", "steeper relief", "light moved", "coarser coding")
 MOVED_MM, QUALITY = 1.0, 40
-STEEPER = 1.75
+STEEPER = 1.55
 """Twice would be a relief that is not allowed to the recipe's longest wavelengths."""
 ROUND = 1.7308
 """The 95 % quantile of the length of a round normal pair over the root of its covariance's trace."""

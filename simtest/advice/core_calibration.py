@@ -20,7 +20,7 @@ from simtest.advice.plan import DISTANCES, Question, main_experiment
 from simtest.dataset.scoring.frames import CaseFrames, RenderedFrame
 from simtest.errors import InputError
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
-from simtest.estimators.names import absolute_names, close_cores, core_hashes, forgive_cores, short_name
+from simtest.estimators.names import absolute_names, close_cores, core_hashes, forgive_cores, short_names
 from simtest.estimators.protocol import Target
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction import regions
@@ -206,8 +206,11 @@ def shift_of(statistics: Array) -> Shift:
     The centre and covariance are those of one half of the frames, the limit is the conformal quantile of the other's.
     """
     first, second = statistics[::2], statistics[1::2]
-    centre, spread = np.nanmean(first, axis=0), np.nanstd(first, axis=0) + 1e-9
-    scaled = np.nan_to_num((first - centre) / spread, nan=0.0)
+    told = np.isfinite(first)
+    centre = np.where(told, first, 0.0).sum(axis=0) / np.maximum(told.sum(axis=0), 1)
+    off = np.where(told, first - centre, 0.0)
+    spread = np.sqrt((off**2).sum(axis=0) / np.maximum(told.sum(axis=0), 1)) + 1e-9
+    scaled = off / spread
     values, vectors = np.linalg.eigh((1 - SHRINKAGE) * np.cov(scaled.T) + SHRINKAGE * np.eye(len(centre)))
     whitening = (vectors / np.sqrt(values)).T / spread
     found = Shift(centre=tuple(centre), whitening=tuple(map(tuple, whitening)), limit=0.0)
@@ -245,7 +248,7 @@ def calibrate_core(
     InputError
         If the core is unknown or answers too seldom.
     """
-    name, (absolute,) = short_name(core), absolute_names([core])
+    (name,), (absolute,) = short_names([core]), absolute_names([core])
     load_estimators([core])
     scope = question.scope
     made = {
