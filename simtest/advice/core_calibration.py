@@ -112,8 +112,8 @@ def kept_frame(frame: RenderedFrame, estimators: Mapping[str, AnyEstimator], det
             error = float(angle_deg(estimate.normal, normal)) if tissue else regions.MOST_DEG
         seen: JsonObject = dict(regions.features(spot, estimate, (width, height)))  # type: ignore[arg-type]
         answers.append({"estimator": row["estimator"], "target": estimate.target, "error_deg": error, **seen})
-    statistics = regions.statistics_of(frame.image)
-    numbers = None if statistics is None else [float(v) if np.isfinite(v) else None for v in statistics]
+    measured = regions.statistics_of(frame.image)
+    numbers = None if measured is None else [v if math.isfinite(v) else None for v in measured.tolist()]
     return {"statistics": numbers, "answers": answers}
 
 
@@ -225,28 +225,10 @@ def calibrate_core(
     core: str, question: Question, out: Path, highlights: int = 2400, detector: str = "colour", every: bool = False,
     engine: Engine | None = None, progress: Progress | None = None,
 ) -> CoreCalibration:  # fmt: skip
-    """Calibrate a core on frames of a scope, and write the calibration; a stopped one goes on.
+    """Calibrate a core, an estimator as `simtest validate` takes it, on so many answers to frames of a scope at least.
 
-    Parameters
-    ----------
-    core : str
-        An installed estimator, or a command or file as `simtest validate` takes it.
-    question : Question
-        Scope, organ, distances and seed.
-    out : Path
-        File of the calibration; the answers to the frames are kept in a folder beside it, and used again.
-    highlights : int
-        Answers at least.
-    detector, every : str, bool
-        How highlights are found: by colour as `simtest reconstruct` finds them, or by peaks as `simtest validate` does;
-        and whether those that are not isolated are taken.
-    engine, progress : optional
-        What runs the batches; called with frames done, frames in all, and what is being done.
-
-    Raises
-    ------
-    InputError
-        If the core is unknown or answers too seldom.
+    The calibration is written into the file `out`; the answers are kept in a folder beside it, and used again. Raises
+    `InputError` if the core is unknown or answers too seldom.
     """
     (name,), (absolute,) = short_names([core]), absolute_names([core])
     load_estimators([core])
@@ -261,12 +243,12 @@ def calibrate_core(
     digest = hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
     folder = out.with_suffix(".frames") / digest[:12]
     make_folder(folder)
-    frames, wanted = list[JsonObject](), LEAST_BATCHES
+    chosen, frames, wanted, have = engine or make_engine(), list[JsonObject](), LEAST_BATCHES, 0
     try:
         while wanted * DISTANCES > len(frames):
             batches = [Batch(batch_question(question, n), absolute, detector, every, folder / f"{n:04d}.json")
                        for n in range(wanted)]  # fmt: skip
-            _make(batches, engine or make_engine(), progress)
+            _make(batches, chosen, progress)
             frames = [frame for batch in batches for frame in read_json(batch.path)]
             answers = Counter(each["target"] for frame in frames for each in frame["answers"])
             have = max(answers.values(), default=0)

@@ -57,19 +57,13 @@ def named_path(_: Any, tokens: Sequence[Token]) -> Path:
     return Path(tokens[0].value)
 
 
-def numbers(_: Any, tokens: Sequence[Token]) -> tuple[float, ...]:
-    """Convert an option to numbers separated by commas."""
+def two_numbers(_: Any, tokens: Sequence[Token]) -> tuple[float, float]:
+    """Convert an option to two numbers separated by a comma."""
     try:
-        return tuple(float(part) for part in tokens[0].value.split(","))
+        first, last = (float(part) for part in tokens[0].value.split(","))
     except ValueError:
-        raise ValueError(f"{tokens[0].value!r}: must be numbers separated by commas, such as 20,60") from None
-
-
-def both(distances: tuple[float, ...]) -> tuple[float, float]:
-    """Return the ends of --distances; raise `InputError` unless there are two."""
-    if len(distances) != 2:
-        raise InputError(f"--distances: {len(distances)} numbers; must be two, the nearest and the farthest, mm")
-    return distances[0], distances[1]
+        raise ValueError(f"{tokens[0].value!r}: must be two numbers separated by a comma, such as 20,60") from None
+    return first, last
 
 
 Names = str | tuple[str, ...] | None
@@ -174,17 +168,13 @@ Estimators = Annotated[
         "'command: PROGRAM ARGUMENT...' or FILE.toml; may be repeated.",
     ),
 ]
-DISTANCES_MM = (20.0, 60.0)
 Distances = Annotated[
-    tuple[float, ...],
+    tuple[float, float],
     Parameter(
         help="Nearest and farthest distance of the wall, mm: 20,60.",
-        negative="",
-        converter=numbers,
-        n_tokens=1,
-        allow_leading_hyphen=True,
+        negative="", converter=two_numbers, n_tokens=1, allow_leading_hyphen=True,
     ),
-]
+]  # fmt: skip
 Out = Annotated[Path, path("Folder for the results; made if need be.", OUT)]
 Realisations = Annotated[int | None, whole("Realisations of each setting.", ("--realisations", "-n"))]
 Views = Annotated[int | None, whole("Viewpoints of each group that varies them, the first ones; default all.")]
@@ -230,7 +220,7 @@ class RegionOptions:
     def read(self) -> "CoreRegions | None":
         """Return them as an experiment and the reconstruction take them; None where no calibration is given."""
         if self.regions is None:
-            if self.refuse_above is not None or self.shifted != "widen":
+            if self != NO_REGIONS:
                 raise InputError("--refuse-above and --shifted need --regions")
             return None
         from simtest.reconstruction.regions import read_calibrations

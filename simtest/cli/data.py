@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from simtest.cli.common import (
-    DISTANCES_MM,
     ONE_PROCESS,
     OUT,
     AsJson,
@@ -20,7 +19,6 @@ from simtest.cli.common import (
     Table,
     Told,
     about,
-    both,
     command,
     command_line,
     counted,
@@ -299,7 +297,7 @@ def advise(
     *,
     out: Out,
     organ: Annotated[str, about("colon, stomach, liver, gallbladder, or plane (a phantom).")] = "colon",
-    distances: Distances = DISTANCES_MM,
+    distances: Distances = (20.0, 60.0),
     camera: Annotated[Path | None, path("Camera file in place of the scope's camera.")] = None,
     bound: Annotated[float, about("Error beyond which a method counts as broken, deg.")] = 5.0,
     frames: Annotated[
@@ -327,7 +325,7 @@ def advise(
     from simtest.advice.plan import Question
     from simtest.advice.scope import read_scope
 
-    question = Question(read_scope(rig, camera), organ, both(distances), bound, frames, seed or 0)
+    question = Question(read_scope(rig, camera), organ, distances, bound, frames, seed or 0)
     with exclusive_folder(out), progress_bar("writing the page") as progress:
         found = run(question, out, progress, workers)
         page = write_advice(found, out, command_line())

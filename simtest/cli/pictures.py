@@ -10,7 +10,6 @@ from cyclopts import App, Parameter
 from simtest.api import Extras, reconstruct_picture
 from simtest.cli.common import (
     DEFAULTS,
-    DISTANCES_MM,
     MOST_ROWS,
     NO_REGIONS,
     ONE_PROCESS,
@@ -25,7 +24,6 @@ from simtest.cli.common import (
     Table,
     Told,
     about,
-    both,
     command,
     command_line,
     counted,
@@ -340,7 +338,7 @@ def core_(
     organ: Annotated[
         Literal["colon", "stomach", "liver", "gallbladder", "plane"], about("Organ whose walls are rendered.")
     ] = "colon",
-    distances: Distances = DISTANCES_MM,
+    distances: Distances = (20.0, 60.0),
     highlights: Annotated[int, whole("Answers that the calibration stands on, at least.")] = 2400,
     detector: Annotated[
         Literal["colour", "peaks"],
@@ -363,7 +361,7 @@ def core_(
     from simtest.advice.plan import Question
     from simtest.advice.scope import read_scope
 
-    question = Question(read_scope(scope), organ, both(distances), seed=seed or 0)
+    question = Question(read_scope(scope), organ, distances, seed=seed or 0)
     with exclusive_file(out), progress_bar() as progress:
         made = calibrate_core(core, question, out, highlights, detector, every, engine.make(), progress)
     rows = [

@@ -11,10 +11,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from pydantic import Field, JsonValue, model_validator
+from pydantic import Field, JsonValue
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.detection.detector import Kind
@@ -47,6 +47,7 @@ Positive = Annotated[float, Field(ge=0)]
 Radii = tuple[Positive, Positive]
 """At 68 and at 95 %."""
 
+Statistics = Annotated[tuple[float, ...], Field(min_length=len(NAMES), max_length=len(NAMES))]
 Numbers = Annotated[tuple[float, ...], Field(min_length=REGRESSORS, max_length=REGRESSORS)]
 Seen = Mapping[Feature, float] | Mapping[Feature, Array]
 """Features of an answer, or of several."""
@@ -55,9 +56,8 @@ Seen = Mapping[Feature, float] | Mapping[Feature, Array]
 def features(spot: "Specularity", estimate: Estimate, size: tuple[int, int]) -> dict[Feature, float]:
     """Return what strata are made by: all of it can be seen without the truth.
 
-    They are the reported standard deviation, deg, the estimate's axis ratio and the detection's score, -1 where there
-    is none; the radius at half height, px; the peak's distance to the frame's border over its width; the number of
-    flags; the number of the kind, -1 where the detector tells none.
+    -1 stands for what is not reported; `border` is the peak's distance to the frame's over its width, `flags` their
+    number, `kind` the number of the kind.
     """
     patch, (x, y), (width, height) = spot.patch, spot.position_px, size
     area = 0.0 if isinstance(patch, Failure) else float(np.count_nonzero(patch.inside(HIGHLIGHT_ISOVALUE, cut=True)))
@@ -147,17 +147,14 @@ def scales(seen: Seen, expected: Expected) -> dict[ScaleKind, Array]:
 
 
 class Shift(Spec):
-    """Where the statistics of the calibration's frames lie, and how far off at most 5 % of such frames are."""
+    """Where the statistics of the calibration's frames lie, and how far off at most 5 % of such frames are.
 
-    centre: tuple[float, ...]
-    whitening: tuple[tuple[float, ...], ...] = Field(description="takes them to unit covariance")
+    `whitening` takes them to unit covariance.
+    """
+
+    centre: Statistics
+    whitening: Annotated[tuple[Statistics, ...], Field(min_length=len(NAMES), max_length=len(NAMES))]
     limit: Positive
-
-    @model_validator(mode="after")
-    def _fits(self) -> Self:
-        if {len(self.centre), len(self.whitening), *map(len, self.whitening)} != {len(NAMES)}:
-            raise ValueError(f"must have {len(NAMES)} statistics")
-        return self
 
     def distance(self, statistics: Array) -> float:
         """Return how far off a frame is, in standard deviations; what it does not tell counts as the centre."""
@@ -182,12 +179,11 @@ class CoreCalibration(Spec):
 
     def outside(self, image: Image, choices: Choices, every: bool) -> str:
         """Return in what a frame is unlike those of the calibration; empty where it is like them."""
-        size, searched = (image.shape[1], image.shape[0]), (choices.detector, every)
-        if size != self.size:
-            return f"of {size[0]} x {size[1]} px, not {self.size[0]} x {self.size[1]}"
-        if searched != (self.detector, self.every):
-            (here, there) = (f"{'all' if e else 'isolated'} {d}" for d, e in (searched, (self.detector, self.every)))
-            return f"searched by another detector: {here}, not {there}"
+        if (image.shape[1], image.shape[0]) != self.size:
+            return f"of {image.shape[1]} x {image.shape[0]} px, not {self.size[0]} x {self.size[1]}"
+        if (choices.detector, every) != (self.detector, self.every):
+            kind = "all" if every else "isolated"
+            return f"searched for {kind} highlights by {choices.detector}, which those were not"
         if self.shift is None:
             return ""
         statistics = statistics_of(image)

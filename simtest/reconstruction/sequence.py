@@ -361,9 +361,8 @@ def _told_by_motion(judged: Sequence[MotionRecord], poses: Poses, is_flipped: bo
 
 def _settings(source: Path, options: Options, calibration: Calibration | None) -> JsonObject:
     """Return the run's settings, through JSON, so that paths and tuples compare with the text and lists of a file."""
-    given = {
-        key: value for key, value in asdict(options).items() if key not in ("poses", "regions") or value is not None
-    }
+    later = ("poses", "regions")
+    given = {key: value for key, value in asdict(options).items() if key not in later or value is not None}
     if calibration is not None:
         content = json.dumps(asdict(calibration), default=str)
         given["calibration"] = hashlib.sha256(content.encode()).hexdigest()

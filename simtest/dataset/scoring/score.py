@@ -74,7 +74,7 @@ def score_table(
     progress : callable, optional
         Called with frames done, frames in all, and what is being done.
     regions : CoreRegions, optional
-        The method's calibration, by which its answers get regions.
+        The method's calibration.
 
     Returns
     -------
