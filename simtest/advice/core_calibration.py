@@ -7,11 +7,13 @@ wall and its light [Dunn, Wasserman and Ramdas, J. Am. Stat. Assoc. 118, 2023, 2
 """
 
 import hashlib
+import itertools
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -48,10 +50,6 @@ FOLDS = 10
 RIDGE, SHRINKAGE = 0.05, 0.1
 """Of the expected error's weights, and of the covariance of the frames' statistics, over a variance of 1."""
 
-FALSE_ALARMS = 0.05
-
-TARGETS: tuple[Target, ...] = ("fine", "base")
-
 # Answers to frames ----------------------------------------------------------------------------------------------------
 
 
@@ -82,24 +80,19 @@ def make_batch(batch: Batch, on_step: OnStep) -> None:
 
 
 def kept_frame(frame: RenderedFrame, estimators: Mapping[str, AnyEstimator], detector: str, every: bool) -> JsonObject:
-    """Return a frame's realism statistics, and features and error of each answer as either surface's normal.
-
-    Found by colour the frame is taken as a picture of 8 bits, as `simtest reconstruct` takes one; by peaks as a run
-    takes it.
-    """
+    """Return a frame's realism statistics, and features and error of each answer as either surface's normal."""
     if detector == "peaks":
         spots = [*answer(frame.view, frame.image, estimators, not every)]
     else:
+        # A picture of 8 bits, as `simtest reconstruct` takes it.
         picture = np.round(255 * frame.image).astype(np.uint8)
         spots = [*reconstruct(picture, frame.calibration, estimators, isolated=not every, detector=detector)]
     told = []
     for row in score(frame.session, frame.view, spots, estimators, {}, not every).rows:
         if row["status"] == "ok":
             spot, name = spots[int(str(row["specularity"]))], str(row["estimator"])
-            given = {
-                each.target: each for each in (spot.estimates[name], spot.organ[name]) if isinstance(each, Estimate)
-            }
-            told += [(row, spot, each) for each in given.values()]
+            given = spot.estimates[name], spot.organ[name]
+            told += [(row, spot, each) for each in {e.target: e for e in given if isinstance(e, Estimate)}.values()]
     (height, width), metal = frame.image.shape[:2], frame.view.instruments
     at = frame.session.exact_points(np.array([estimate.look_px for _, _, estimate in told]).reshape(-1, 2))
     answers = list[JsonObject]()
@@ -166,8 +159,8 @@ def interval_scores(radius_deg: Array, error_deg: Array) -> Array:
 def expected_of(seen: Mapping[Feature, Array], error_deg: Array, frames: IntArray) -> Expected:
     """Fit the error that is expected of an answer by its features (ridge regression).
 
-    The logarithm is that of the error and the median error, as errors near 0 are chance. Frames weigh by the root of
-    the number of their answers.
+    The median is added to errors before the logarithm, as errors near 0 are chance. Frames weigh by the root of the
+    number of their answers.
     """
     rows, (_, which, counts) = regions.regressors(seen), np.unique(frames, return_inverse=True, return_counts=True)
     weights = 1 / np.sqrt(counts[which])
@@ -215,7 +208,7 @@ def shift_of(statistics: Array) -> Shift:
     whitening = (vectors / np.sqrt(values)).T / spread
     found = Shift(centre=tuple(centre), whitening=tuple(map(tuple, whitening)), limit=0.0)
     off = np.array([found.distance(each) for each in second])
-    return found.model_copy(update={"limit": quantile(off, np.arange(len(off)), 1 - FALSE_ALARMS)})
+    return found.model_copy(update={"limit": quantile(off, np.arange(len(off)), regions.LEVELS[1])})
 
 
 # The whole ------------------------------------------------------------------------------------------------------------
@@ -248,7 +241,10 @@ def calibrate_core(
         while wanted * DISTANCES > len(frames):
             batches = [Batch(batch_question(question, n), absolute, detector, every, folder / f"{n:04d}.json")
                        for n in range(wanted)]  # fmt: skip
-            _make(batches, chosen, progress)
+            missing, total = [batch for batch in batches if not batch.path.exists()], DISTANCES * wanted
+            done = itertools.count(total - DISTANCES * len(missing) + 1)
+            for _ in chosen.run(make_batch, missing, partial(_tell, progress, done, total)):
+                pass
             frames = [frame for batch in batches for frame in read_json(batch.path)]
             answers = Counter(each["target"] for frame in frames for each in frame["answers"])
             have = max(answers.values(), default=0)
@@ -259,8 +255,8 @@ def calibrate_core(
                 raise InputError(f"{name}: {have} answers in {len(frames)} frames; {highlights} take too many")
     finally:
         close_cores()
-    strata: dict[Target, Strata] = {}
-    for target in TARGETS:
+    strata = dict[Target, Strata]()
+    for target in ("fine", "base"):
         own = [(i, each) for i, frame in enumerate(frames) for each in frame["answers"] if each["target"] == target]
         of = np.array([i for i, _ in own], int)
         if len(np.unique(of)) >= LEAST_FRAMES:
@@ -284,16 +280,6 @@ def batch_question(question: Question, number: int) -> Question:
     return replace(question, frames=DISTANCES, seed=seed)
 
 
-def _make(batches: Sequence[Batch], engine: Engine, progress: Progress | None) -> None:
-    """Make the batches that are not there yet."""
-    missing = [batch for batch in batches if not batch.path.exists()]
-    total, done = DISTANCES * len(batches), DISTANCES * (len(batches) - len(missing))
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress:
-            progress(done, total, "rendering and answering")
-
-    for _ in engine.run(make_batch, missing, step):
-        pass
+def _tell(progress: Progress | None, done: Iterator[int], total: int) -> None:
+    if progress:
+        progress(next(done), total, "rendering and answering")

@@ -101,7 +101,6 @@ def run_bench(
     chosen = chosen_parts(suite, parts)
     told = core_record(core)
     if regions is not None:
-        # What is refused by it has another score.
         files: Json = [provenance.file_hash(Path(file)) for file in regions.files]
         told["regions"] = digest_of({**regions.model_dump(mode="json"), "files": files})
     make_folder(folder)

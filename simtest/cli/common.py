@@ -208,17 +208,15 @@ class RegionOptions:
     """Calibrations of cores, and what is refused by them."""
 
     regions: Annotated[
-        list[Path] | None,
-        path("Calibration of a core, of simtest calibrate core: its answers get regions; may be repeated."),
+        list[Path] | None, path("A core's calibration (calibrate core): its answers get regions; may be repeated.")
     ] = None
     refuse_above: Annotated[float | None, about("Refuse answers whose calibrated 95 % radius is larger, deg.")] = None
     shifted: Annotated[
-        Literal["widen", "refuse"],
-        about("What answers in frames unlike the calibration's get: the region of the worst stratum, or none."),
+        Literal["widen", "refuse"], about("Frames unlike the calibration's get its worst region, or are refused.")
     ] = "widen"
 
     def read(self) -> "CoreRegions | None":
-        """Return them as an experiment and the reconstruction take them; None where no calibration is given."""
+        """Return them; None where no calibration is given."""
         if self.regions is None:
             if self != NO_REGIONS:
                 raise InputError("--refuse-above and --shifted need --regions")

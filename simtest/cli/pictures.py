@@ -328,34 +328,24 @@ calibrate = App(name="calibrate", help="Measure where the lights are, or how far
 @calibrate.command(name="core")
 @command
 def core_(
-    core: str,
+    core: Annotated[str, about("An estimator by name, 'command: PROGRAM ARGUMENT...' or FILE.toml, as --estimator.")],
     /,
     *,
-    scope: Annotated[
-        str, about("A scope file (TOML), or a preset: colocated, colonoscope_2, colonoscope_3, laparoscope.")
-    ],
+    scope: Annotated[str, about("A preset or a TOML file, as advise takes it.")],
     out: Annotated[Path, path("File of the calibration, JSON; answers to the frames stay in a folder beside it.", OUT)],
-    organ: Annotated[
-        Literal["colon", "stomach", "liver", "gallbladder", "plane"], about("Organ whose walls are rendered.")
-    ] = "colon",
+    organ: Annotated[str, about("colon, stomach, liver, gallbladder, or plane (a phantom).")] = "colon",
     distances: Distances = (20.0, 60.0),
     highlights: Annotated[int, whole("Answers that the calibration stands on, at least.")] = 2400,
     detector: Annotated[
-        Literal["colour", "peaks"],
-        about("How highlights are found: colour as by reconstruct in pictures, peaks as by validate."),
+        Literal["colour", "peaks"], about("How highlights are found: as by reconstruct in pictures, or by validate.")
     ] = "colour",
     every: Annotated[bool, flag("Take highlights that are not isolated too.", "--all")] = False,
     seed: Seed = None,
     engine: EngineOptions = ONE_PROCESS,
 ) -> Told:
-    """Find how far off a core's normals are, on rendered frames of your scope; a stopped calibration goes on.
+    """Find how far off a core's normals are, on rendered frames of your scope: a file for --regions of other commands.
 
-    reconstruct, validate, score and bench take the file as --regions.
-
-    Parameters
-    ----------
-    core : str
-        An installed estimator, 'command: PROGRAM ARGUMENT...' or FILE.toml, as --estimator takes it.
+    A stopped calibration goes on.
     """
     from simtest.advice.core_calibration import calibrate_core
     from simtest.advice.plan import Question
@@ -364,13 +354,11 @@ def core_(
     question = Question(read_scope(scope), organ, distances, seed=seed or 0)
     with exclusive_file(out), progress_bar() as progress:
         made = calibrate_core(core, question, out, highlights, detector, every, engine.make(), progress)
-    rows = [
-        (target, str(each.highlights), str(each.frames), *(f"{value:.3g}" for value in each.error_deg))
-        for target, strata in made.strata.items()
-        for each in strata.parts
-    ]
-    heads = ("normal of", "answers", "frames", "68 % within (deg)", "95 % within (deg)")
-    return Told([out], made.model_dump(mode="json"), [Table(heads, rows)])
+    lines = [f"{made.highlights} answers in {made.frames} frames"]
+    for target, strata in made.strata.items():
+        last = [part.error_deg[1] for part in strata.parts]
+        lines.append(f"{target} normals: 95 % within {min(last):.3g} to {max(last):.3g} deg, in {len(last)} strata")
+    return Told([out], made.model_dump(mode="json"), lines)
 
 
 @calibrate.command

@@ -53,10 +53,7 @@ class EstimatedCurvature:
 
 @dataclass(frozen=True)
 class CalibratedRegion:
-    """How far the true normal is at most in 68 and 95 % of such answers, deg, and what says so.
-
-    `simtest calibrate core` found it on rendered frames (`simtest.reconstruction.regions`).
-    """
+    """How far off 68 and 95 % of such answers are at most, deg, and what says so (`simtest calibrate core`)."""
 
     radius_68_deg: float
     radius_95_deg: float

@@ -68,10 +68,7 @@ def columns_of(entries: Sequence[JsonObject]) -> tuple[str, ...]:
 
 
 def normals_rows(entries: Iterable[JsonObject], columns: Sequence[str] = COLUMNS) -> Iterator[tuple[object, ...]]:
-    """Yield a row of the columns for each entry of ``specularities``, estimator and candidate; 0 is the proposed one.
-
-    The columns are `COLUMNS`, and any keys of estimates behind them.
-    """
+    """Yield a row of the columns for each entry of ``specularities``, estimator and candidate, 0 the proposed one."""
     others = columns[len(COLUMNS) :]
     for entry in entries:
         peak = (None, None) if entry["peak_px"] is None else (float(v) for v in entry["peak_px"])

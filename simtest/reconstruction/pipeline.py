@@ -204,10 +204,9 @@ def run(image: Image, calibration: Calibration, options: Options, is_picture: bo
     spots, no_cloud = _estimate(detection, chosen, beside, options)
     numbered = [replace(spot, id=i) for i, spot in enumerate(spots)]
     if options.regions is not None:
-        # Imported here: models of files are slow to load.
         from simtest.reconstruction.regions import with_regions
 
-        numbered = with_regions(numbered, image, choices, options)
+        numbered = with_regions(numbered, image, choices, options.every, options.regions)
     return Specularities(numbered, detection, choices, no_cloud=no_cloud)
 
 

@@ -384,9 +384,8 @@ class Specularities(list[Specularity]):
         from simtest.reconstruction.outputs import columns_of, normals_rows
 
         entries = [spot.to_json(drawn=False) for spot in self]
-        columns = columns_of(entries)
-        rows = [*normals_rows(entries, columns)]
-        return pl.DataFrame(rows, schema=list(columns), orient="row", infer_schema_length=None)
+        names = columns_of(entries)
+        return pl.DataFrame([*normals_rows(entries, names)], schema=[*names], orient="row", infer_schema_length=None)
 
     def __repr__(self) -> str:
         answered = sum(each.best is not None for each in self)

@@ -22,20 +22,18 @@ from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.protocol import CalibratedRegion, Target
 from simtest.reconstruction.images import is_coloured
-from simtest.reconstruction.options import Choices, Options
+from simtest.reconstruction.options import Choices
 from simtest.reconstruction.statistics import LEAST_SIDE, NAMES, measure, summarise
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.files import read_json
+from simtest.spec.recipes import CoreRegions
 from simtest.spec.spec_model import Spec, validate
 
 if TYPE_CHECKING:
     from simtest.reconstruction.records import Specularity
 
 LEVELS = (0.68, 0.95)
-MOST_DEG = 180.0
-"""No direction is farther off."""
-
-REGRESSORS = 11
+MOST_DEG, REGRESSORS = 180.0, 11
 
 Format = Literal["simtest core calibration, version 1"]
 Feature = Literal["sigma_deg", "axis_ratio", "score", "radius_px", "border", "flags", "kind"]
@@ -147,10 +145,7 @@ def scales(seen: Seen, expected: Expected) -> dict[ScaleKind, Array]:
 
 
 class Shift(Spec):
-    """Where the statistics of the calibration's frames lie, and how far off at most 5 % of such frames are.
-
-    `whitening` takes them to unit covariance.
-    """
+    """Where the frames' statistics lie, what takes them to unit covariance, and how far off at most 5 % are."""
 
     centre: Statistics
     whitening: Annotated[tuple[Statistics, ...], Field(min_length=len(NAMES), max_length=len(NAMES))]
@@ -209,19 +204,14 @@ def read_calibrations(files: Sequence[str]) -> dict[str, CoreCalibration]:
 
 
 def with_regions(
-    spots: "Sequence[Specularity]", image: Image, choices: Choices, options: Options
+    spots: "Sequence[Specularity]", image: Image, choices: Choices, every: bool, given: CoreRegions
 ) -> "list[Specularity]":
-    """Return the specularities of a frame with the regions of the calibrated cores' answers, or with their refusals.
-
-    Raises `InputError` where none of the files is of an estimator that is run.
-    """
-    given = options.regions
-    assert given is not None
+    """Return the specularities of a frame with the regions of the calibrated cores' answers, or with their refusals."""
     files = read_calibrations(given.files)
     if not files.keys() & {*choices.estimators}:
         run = ", ".join(choices.estimators)
         raise InputError(f"{', '.join(given.files)}: of {', '.join(files)}; must be of an estimator that runs: {run}")
-    outside = {name: own.outside(image, choices, options.every) for name, own in files.items()}
+    outside = {name: own.outside(image, choices, every) for name, own in files.items()}
     size, most = (image.shape[1], image.shape[0]), given.refuse_above_deg or MOST_DEG
 
     def judged(spot: "Specularity", name: str, estimate: Estimate | Failure) -> Estimate | Failure:
@@ -240,10 +230,10 @@ def with_regions(
     made = []
     for spot in spots:
         results = {name: judged(spot, name, each) for name, each in spot.estimates.items()}
-        organ = {name: (judged(spot, name, each), each) for name, each in spot.organ.items()}
-        # An organ's normal has no failures: a refused one stays without a region.
-        stays = {name: new if isinstance(new, Estimate) else old for name, (new, old) in organ.items()}
-        made.append(replace(spot, estimates=results, organ=stays))
+        organ = {name: judged(spot, name, each) for name, each in spot.organ.items()}
+        # An organ's normal is no failure: a refused one stays without a region.
+        kept = {name: each for name, each in organ.items() if isinstance(each, Estimate)}
+        made.append(replace(spot, estimates=results, organ={**spot.organ, **kept}))
     return made
 
 

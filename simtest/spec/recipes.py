@@ -151,12 +151,8 @@ class CoreRegions(Spec):
     """Calibrations of cores (`simtest calibrate core`), whose answers then have regions of 68 and 95 %."""
 
     files: tuple[str, ...] = Field(min_length=1)
-    refuse_above_deg: float | None = Field(
-        None, gt=0, le=180, description="answers whose 95 % region is larger are refused; default none"
-    )
-    shifted: Literal["widen", "refuse"] = Field(
-        "widen", description="what answers in frames unlike the calibration's get: the worst region, or none"
-    )
+    refuse_above_deg: float | None = Field(None, gt=0, le=180, description="answers with a larger one are refused")
+    shifted: Literal["widen", "refuse"] = Field("widen", description="answers in frames unlike the calibration's")
 
 
 class Experiment(Spec):

@@ -14,11 +14,12 @@ from simtest.validation.cases import Case
 
 def fingerprint(experiment: Experiment, cases: list[Case], variant: str) -> str:
     """Return a hash of everything that determines a run's results."""
+    calibrations = () if experiment.regions is None else experiment.regions.files
     return _hash(
         {
             "experiment": experiment.model_dump(mode="json"),
             "scenes": [case.data for case in cases],
-            "inputs": input_hashes(cases) | _regions(experiment),
+            "inputs": input_hashes(cases) | {each: provenance.file_hash(Path(each)) for each in calibrations},
             "versions": provenance.versions() | ESTIMATORS.distributions(experiment.estimators),
             "cores": core_hashes(experiment.estimators),
             "source": provenance.source_hash(),
@@ -34,12 +35,6 @@ def definition(experiment: Experiment, cases: list[Case]) -> str:
     scenes = [case.data for case in cases]
     itself = experiment.model_dump(mode="json", exclude={"title", "description"})
     return _hash({"experiment": itself, "scenes": scenes, "inputs": files})
-
-
-def _regions(experiment: Experiment) -> dict[str, str]:
-    """Return the hashes of the calibrations of cores."""
-    files = () if experiment.regions is None else experiment.regions.files
-    return {file: provenance.file_hash(Path(file)) for file in files}
 
 
 def _hash(content: Json) -> str:

@@ -337,9 +337,8 @@ class Source:
         """Return it with the calibration by which answers get regions; raise `InputError` for a dataset."""
         if not isinstance(self.recipe, Experiment):
             raise InputError(f"{self.folder}: is a dataset; --regions is for answers to the frames of a run")
-        experiment = self.recipe.model_copy(update={"regions": regions})
-        parts = frames_of_cases(experiment, self.cases, self.variant)
-        return replace(self, recipe=experiment, parts=parts)
+        recipe = self.recipe.model_copy(update={"regions": regions})
+        return replace(self, recipe=recipe, parts=frames_of_cases(recipe, self.cases, self.variant))
 
     def summary(self, results: pl.DataFrame, described: Mapping[str, str]) -> ExperimentSummary:
         """Return what summary.json says of results; `described` are the estimators."""
