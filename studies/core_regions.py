@@ -79,13 +79,15 @@ class Work:
         """Return the experiment of the batch with its shift."""
         around = plan.surroundings(question)
         if self.kind == "steeper relief":
-            doubled = copy.deepcopy(around)
-            for n, band in enumerate(doubled.set["surface"]["relief"]["bands"]):
-                band["slope_deg"] = STEEPER * band["slope_deg"]
-                if (key := f"surface.relief.bands.{n}.slope_deg") in doubled.random:
-                    low, high = doubled.random[key]
-                    doubled.random[key] = STEEPER * low, STEEPER * high
-            plan.surroundings, kept = (lambda question: doubled), plan.surroundings
+            steeper = copy.deepcopy(around)
+            for n, band in enumerate(steeper.set["surface"]["relief"]["bands"]):
+                key = f"surface.relief.bands.{n}.slope_deg"
+                if key in steeper.random:
+                    low, high = steeper.random[key]
+                    steeper.random[key] = STEEPER * low, STEEPER * high
+                else:
+                    band["slope_deg"] = STEEPER * band["slope_deg"]
+            plan.surroundings, kept = (lambda question: steeper), plan.surroundings
             try:
                 return main_experiment(question)
             finally:

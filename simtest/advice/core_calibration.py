@@ -46,9 +46,8 @@ LEAST_HIGHLIGHTS, LEAST_FRAMES = 100, 50
 ORDER: tuple[Feature, ...] = ("sigma_deg", "score", "flags", "radius_px", "border", "axis_ratio", "kind")
 """In which strata are parted."""
 
-FOLDS = 10
-RIDGE, SHRINKAGE = 0.05, 0.1
-"""Of the expected error's weights, and of the covariance of the frames' statistics, over a variance of 1."""
+FOLDS, RIDGE, SHRINKAGE = 10, 0.05, 0.1
+"""The last two of the expected error's weights and of the frames' statistics, over a variance of 1."""
 
 # Answers to frames ----------------------------------------------------------------------------------------------------
 

@@ -208,7 +208,7 @@ class RegionOptions:
     """Calibrations of cores, and what is refused by them."""
 
     regions: Annotated[
-        list[Path] | None, path("A core's calibration (calibrate core): its answers get regions; may be repeated.")
+        list[Path] | None, flag("A core's calibration (calibrate core): its answers get regions; may be repeated.")
     ] = None
     refuse_above: Annotated[float | None, about("Refuse answers whose calibrated 95 % radius is larger, deg.")] = None
     shifted: Annotated[

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import polars as pl
 import pytest
@@ -14,6 +15,7 @@ from simtest.advice import core_calibration
 from simtest.advice.core_calibration import ORDER, calibrate_core, kept_frame, quantile, shift_of, strata_of
 from simtest.advice.plan import Question
 from simtest.advice.scope import read_scope
+from simtest.cli.commands import APP
 from simtest.cli.common import RegionOptions
 from simtest.dataset.scoring.frames import CaseFrames
 from simtest.errors import Failure, InputError, Reason
@@ -318,6 +320,21 @@ def test_a_stopped_calibration_goes_on_to_the_same_file(tmp_path, monkeypatch):
     # Another seed's answers are kept apart.
     other = calibrate_core("cone_axis", replace(question, seed=6), tmp_path / "part.json", 10, "peaks", True)
     assert other.strata != whole.strata
+
+
+def test_the_command_line_takes_calibrations(tmp_path, monkeypatch):
+    calibration(tmp_path, detector="colour")
+    monkeypatch.chdir(tmp_path)
+    cv2.imwrite("picture.png", np.round(255 * lobes()).astype(np.uint8))
+    words = (
+        "reconstruct picture.png --fov 60 --out out --detector peaks --estimator cone_axis --regions calibration.json"
+    )
+    with pytest.warns(UserWarning):
+        APP(words.split(), exit_on_error=False, result_action="return_value")
+    told = json.loads((tmp_path / "out" / "normals.json").read_text())["specularities"]
+    assert len(told) == 2
+    assert all("peaks" in each["estimates"]["cone_axis"]["region_source"] for each in told)
+    assert "radius_95_deg" in (tmp_path / "out" / "normals.csv").read_text().splitlines()[0]
 
 
 def test_options_of_regions_need_a_file(tmp_path):
