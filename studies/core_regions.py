@@ -27,8 +27,8 @@ import numpy as np
 
 from benchmarks.measuring import print_markdown
 from simtest.advice import core_calibration, plan
-from simtest.advice.core_calibration import interval_scores, kept_frame, quantile, shift_of, strata_of
-from simtest.advice.plan import Question, main_experiment
+from simtest.advice.core_calibration import batch_experiment, interval_scores, kept_frame, quantile, shift_of, strata_of
+from simtest.advice.plan import Question
 from simtest.advice.scope import read_scope
 from simtest.dataset.scoring.frames import CaseFrames, RenderedFrame
 from simtest.estimators import load_estimators
@@ -67,7 +67,7 @@ class Work:
         """Render, and return what all cores answer to each frame."""
         organ = "liver" if self.kind == "other organ" else "colon"
         question = Question(read_scope(self.scope), organ, seed=SEEDS.get(self.kind, 3))
-        experiment = self.changed(core_calibration.batch_question(question, self.number))
+        experiment = self.changed(question)
         estimators, made = load_estimators(CORES), []
         for number, case in enumerate(expand(experiment)):
             for frame in CaseFrames(experiment, case, number, "llvm_ad_rgb"):
@@ -89,10 +89,10 @@ class Work:
                     band["slope_deg"] = STEEPER * band["slope_deg"]
             plan.surroundings, kept = (lambda question: steeper), plan.surroundings
             try:
-                return main_experiment(question)
+                return batch_experiment(question, self.number)
             finally:
                 plan.surroundings = kept
-        experiment = main_experiment(question)
+        experiment = batch_experiment(question, self.number)
         (group,) = experiment.groups
         held = dict(group.set)
         if self.kind == "coarser coding":

@@ -33,6 +33,7 @@ from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import JsonObject, make_folder, read_json, write_json
 from simtest.runtime.processes import Engine, OnStep, make_engine
 from simtest.runtime.seeds import Stage, integer
+from simtest.spec import Experiment
 from simtest.validation.cases import expand
 from simtest.validation.realisation import answer, score
 from simtest.validation.runner import Progress, variant_of
@@ -57,6 +58,7 @@ class Batch:
     """Some frames of a scope that a core answers to, and the file where its answers are kept."""
 
     question: Question
+    number: int
     core: str
     detector: str
     every: bool
@@ -68,7 +70,7 @@ def make_batch(batch: Batch, on_step: OnStep) -> None:
     # The answers must not depend on the batches before.
     forgive_cores()
     estimators, frames = load_estimators([batch.core]), list[JsonObject]()
-    experiment = main_experiment(batch.question)
+    experiment = batch_experiment(batch.question, batch.number)
     cases = expand(experiment)
     variant = variant_of(cases)
     for number, case in enumerate(cases):
@@ -238,7 +240,7 @@ def calibrate_core(
     chosen, frames, wanted, have = engine or make_engine(), list[JsonObject](), LEAST_BATCHES, 0
     try:
         while wanted * DISTANCES > len(frames):
-            batches = [Batch(batch_question(question, n), absolute, detector, every, folder / f"{n:04d}.json")
+            batches = [Batch(question, n, absolute, detector, every, folder / f"{n:04d}.json")
                        for n in range(wanted)]  # fmt: skip
             missing, total = [batch for batch in batches if not batch.path.exists()], DISTANCES * wanted
             done = itertools.count(total - DISTANCES * len(missing) + 1)
@@ -273,10 +275,13 @@ def calibrate_core(
     return calibration
 
 
-def batch_question(question: Question, number: int) -> Question:
-    """Return the question of a batch: a frame at each distance, of a seed of its own."""
+def batch_experiment(question: Question, number: int) -> Experiment:
+    """Return the frames of a batch: those of an advice, one at each distance, in the organ's own colours."""
     seed = integer(question.seed, "calibrate core", "batch", number, Stage.SWEEP)
-    return replace(question, frames=DISTANCES, seed=seed)
+    experiment = main_experiment(replace(question, frames=DISTANCES, seed=seed))
+    (group,) = experiment.groups
+    held = {key: value for key, value in group.set.items() if key != "reflectance.albedo"}
+    return experiment.model_copy(update={"groups": (group.model_copy(update={"set": held}),)})
 
 
 def _tell(progress: Progress | None, done: Iterator[int], total: int) -> None:
