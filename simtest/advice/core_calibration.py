@@ -233,7 +233,6 @@ def calibrate_core(
         "distances_mm": [*question.distances_mm], "seed": question.seed, "detector": detector, "every": every,
         "version": provenance.version(), "source": provenance.source_hash(),
     }  # fmt: skip
-    # Answers of other settings stay apart.
     digest = hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
     folder = out.with_suffix(".frames") / digest[:12]
     make_folder(folder)

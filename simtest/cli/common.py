@@ -207,13 +207,11 @@ ONE_PROCESS = EngineOptions()
 class RegionOptions:
     """Calibrations of cores, and what is refused by them."""
 
-    regions: Annotated[
-        list[Path] | None, flag("A core's calibration (calibrate core): its answers get regions; may be repeated.")
-    ] = None
+    regions: Annotated[list[Path] | None, flag("A core's calibration: its answers get regions; may be repeated.")] = (
+        None
+    )
     refuse_above: Annotated[float | None, about("Refuse answers whose calibrated 95 % radius is larger, deg.")] = None
-    shifted: Annotated[
-        Literal["widen", "refuse"], about("Frames unlike the calibration's get its worst region, or are refused.")
-    ] = "widen"
+    shifted: Annotated[Literal["widen", "refuse"], about("In unlike frames: the worst region, or none.")] = "widen"
 
     def read(self) -> "CoreRegions | None":
         """Return them; None where no calibration is given."""

@@ -336,9 +336,7 @@ def core_(
     organ: Annotated[str, about("colon, stomach, liver, gallbladder, or plane (a phantom).")] = "colon",
     distances: Distances = (20.0, 60.0),
     highlights: Annotated[int, whole("Answers that the calibration stands on, at least.")] = 2400,
-    detector: Annotated[
-        Literal["colour", "peaks"], about("How highlights are found: as by reconstruct in pictures, or by validate.")
-    ] = "colour",
+    detector: Annotated[Literal["colour", "peaks"], about("As reconstruct or as validate finds them.")] = "colour",
     every: Annotated[bool, flag("Take highlights that are not isolated too.", "--all")] = False,
     seed: Seed = None,
     engine: EngineOptions = ONE_PROCESS,

@@ -12,7 +12,15 @@ from hypothesis import strategies as st
 
 import simtest
 from simtest.advice import core_calibration
-from simtest.advice.core_calibration import ORDER, calibrate_core, kept_frame, quantile, shift_of, strata_of
+from simtest.advice.core_calibration import (
+    ORDER,
+    batch_experiment,
+    calibrate_core,
+    kept_frame,
+    quantile,
+    shift_of,
+    strata_of,
+)
 from simtest.advice.plan import Question
 from simtest.advice.scope import read_scope
 from simtest.cli.commands import APP
@@ -289,6 +297,15 @@ def test_a_run_has_the_regions_and_is_another_run(tmp_path):
     assert prints[0] != prints[1]
     refused = plain.model_copy(update={"regions": regions.model_copy(update={"refuse_above_deg": 0.01})})
     assert {*simtest.validate(refused, tmp_path / "refused").results["status"]} == {"refused", "ok"}
+
+
+def test_batches_differ_and_show_the_organs_colours():
+    question = Question(read_scope("colocated"), seed=4)
+    first, second, again = (batch_experiment(question, number) for number in (0, 1, 0))
+    assert first == again
+    assert first.groups[0].pool != second.groups[0].pool
+    # An advice's walls have no vessels.
+    assert "reflectance.albedo" not in first.groups[0].set
 
 
 @pytest.mark.slow
