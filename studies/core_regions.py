@@ -1,10 +1,11 @@
 """Regions of cores by their calibration (`simtest calibrate core`): coverage on fresh and on shifted frames, sharpness.
 
-    python -m studies.core_regions FOLDER [--scope colocated] [--batches 26] [--shifted 6] [--like peaks] [--workers 2]
+    python -m studies.core_regions FOLDER [--scope colocated] [--batches 32] [--shifted 6] [--like peaks] [--workers 2]
 
-All cores answer to the same frames of the scope: `--batches` of 8 frames to calibrate on, as many of another seed to
-judge on, and `--shifted` batches each of another organ, of a steeper relief, of lights 1 mm from where they are
-told, and of coarser coding. The answers stay in FOLDER, and a stopped study goes on. Printed are
+All cores (`CORES`; the network needs the extra `onnx`, and lights beside the camera as in colonoscope_2) answer to the
+same frames of the scope: `--batches` of 8 frames to calibrate on, as many of another seed to judge on, and `--shifted`
+batches each of another organ, of a steeper relief, of lights 1 mm from where they are told, and of coarser coding. The
+answers stay in FOLDER, and a stopped study goes on. Printed are
 
 1. the coverage of the regions of 68 and 95 %, with the frame as the unit; the strata whose coverage is below 90 %
    beyond chance (Holm, 1 %); the mean interval score over that of one radius for all answers, and over that of errors
@@ -251,7 +252,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scope", default="colocated")
-    parser.add_argument("--batches", type=int, default=26)
+    parser.add_argument("--batches", type=int, default=32)
     parser.add_argument("--shifted", type=int, default=6)
     parser.add_argument("--like", choices=("peaks", "colour"), default="peaks")
     parser.add_argument("--workers", type=int, default=2)

@@ -29,7 +29,7 @@ COLUMNS = (
 )  # fmt: skip
 
 REGION_COLUMNS = ("radius_68_deg", "radius_95_deg", "region_source")
-"""Further ones where cores were calibrated."""
+"""Further ones where a core's calibration is given."""
 
 FILES = ("normals.json", "normals.csv", "normals.ply", "overlay.png", "constraints.npz", "index.html")
 

@@ -346,7 +346,7 @@ def test_the_command_line_takes_calibrations(tmp_path, monkeypatch):
     words = (
         "reconstruct picture.png --fov 60 --out out --detector peaks --estimator cone_axis --regions calibration.json"
     )
-    with pytest.warns(UserWarning):
+    with pytest.warns(UserWarning, match="no calibration"):
         APP(words.split(), exit_on_error=False, result_action="return_value")
     told = json.loads((tmp_path / "out" / "normals.json").read_text())["specularities"]
     assert len(told) == 2
