@@ -88,6 +88,7 @@ class Reason(StrEnum):
     NOT_KNOWN = "not_known"
     NO_ESTIMATE = "no_estimate"
     UNDECIDED = "undecided"
+    REFUSED = "refused"
     ESTIMATOR_ERROR = "estimator_error"
     CORE_DIED = "core_died"
     CORE_TIMEOUT = "core_timeout"
@@ -113,6 +114,7 @@ _MEANINGS = {
     Reason.UNRESOLVED: "the spot is too small to have a shape",
     Reason.NOT_KNOWN: "the estimator needs what the calibration does not tell, such as the lights' positions",
     Reason.UNDECIDED: "the pictures do not tell the signs of the curvatures apart",
+    Reason.REFUSED: "the core's calibration finds its errors too large here, or the frame unlike its own",
     Reason.NO_ESTIMATE: "the estimator found nothing that it could answer for",
     Reason.ESTIMATOR_ERROR: "the estimator stopped with an error",
     Reason.CORE_DIED: "the core's process ended before it answered",

@@ -43,6 +43,7 @@ from simtest.runtime import provenance
 from simtest.runtime.files import Json, JsonObject, make_folder, write_json
 from simtest.runtime.processes import Engine, make_engine
 from simtest.runtime.resources import parse_model
+from simtest.spec.recipes import CoreRegions
 from simtest.validation.runner import Progress, run_experiments
 
 PART = "dense"
@@ -87,21 +88,25 @@ def run_bench(
     engine: Engine | None = None,
     progress: Progress | None = None,
     variant: str | None = None,
+    regions: CoreRegions | None = None,
 ) -> BenchRun:
     """Run a core, an installed estimator or a command, on a suite and write its certificate; a stopped run goes on.
 
     `folder` gets a run's folder for each part, by default all that are scored by highlights, and certificate.json. The
-    figures do not depend on the engine. Raises `InputError` if a part or the core is unknown, or the folder holds
-    something else.
+    figures do not depend on the engine. `regions` is the core's calibration. Raises `InputError` if a part or the core
+    is unknown, or the folder holds something else.
     """
     if not core.strip():
         raise InputError('--core: is empty; must be an installed estimator, or a command as in "command: ./core"')
     chosen = chosen_parts(suite, parts)
     told = core_record(core)
+    if regions is not None:
+        files: Json = [provenance.file_hash(Path(file)) for file in regions.files]
+        told["regions"] = digest_of({**regions.model_dump(mode="json"), "files": files})
     make_folder(folder)
     scores: dict[str, JsonObject] = {}
     for part in chosen:
-        experiment = experiment_of(suite, part, core)
+        experiment = experiment_of(suite, part, core).model_copy(update={"regions": regions})
         # Part by part: the colours that one part needs are not those that another is rendered in.
         (run,) = run_experiments([(experiment, folder / part)], "", variant, progress, engine)
         scores[part] = score_part(run.results, layout_of(suite, part)).to_json()

@@ -26,7 +26,7 @@ COMMANDS = {
     "view": "Show a scene in 3D: curvature, camera, lights, true and estimated normals.",
     "export": "Write a scene as files that Mitsuba itself loads.",
     "reconstruct": "Reconstruct the normals at the specularities of a picture, a folder or a video.",
-    "calibrate": "Measure the positions of the lights from pictures of a ball or plate.",
+    "calibrate": "Measure where the lights are, or how far off a core's normals are.",
     "advise": "Measure what a scope and its lights can reach: method, expected error, break-points.",
     "twin": "Render twins of a picture's highlights, and measure the error at each.",
     "realism": "Measure how far generated frames are from real ones.",

@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 from cyclopts import Parameter, Token
 
 from simtest.cli.main import MANNERS
+from simtest.errors import InputError
 from simtest.runtime.files import as_json
 
 if TYPE_CHECKING:
     from simtest.reconstruction.options import Options
     from simtest.runtime.processes import Engine
+    from simtest.spec.recipes import CoreRegions
 
 
 Row = TypeVar("Row")
@@ -53,6 +55,15 @@ def named_path(_: Any, tokens: Sequence[Token]) -> Path:
         # Such names cannot be printed, nor stand in JSON, and libraries that write pictures break down over them.
         raise ValueError(f"is no UTF-8 name: {tokens[0].value!a}; must be one (and LC_ALL a UTF-8 locale)") from None
     return Path(tokens[0].value)
+
+
+def two_numbers(_: Any, tokens: Sequence[Token]) -> tuple[float, float]:
+    """Convert an option to two numbers separated by a comma."""
+    try:
+        first, last = (float(part) for part in tokens[0].value.split(","))
+    except ValueError:
+        raise ValueError(f"{tokens[0].value!r}: must be two numbers separated by a comma, such as 20,60") from None
+    return first, last
 
 
 Names = str | tuple[str, ...] | None
@@ -157,6 +168,13 @@ Estimators = Annotated[
         "'command: PROGRAM ARGUMENT...' or FILE.toml; may be repeated.",
     ),
 ]
+Distances = Annotated[
+    tuple[float, float],
+    Parameter(
+        help="Nearest and farthest distance of the wall, mm: 20,60.",
+        negative="", converter=two_numbers, n_tokens=1, allow_leading_hyphen=True,
+    ),
+]  # fmt: skip
 Out = Annotated[Path, path("Folder for the results; made if need be.", OUT)]
 Realisations = Annotated[int | None, whole("Realisations of each setting.", ("--realisations", "-n"))]
 Views = Annotated[int | None, whole("Viewpoints of each group that varies them, the first ones; default all.")]
@@ -182,6 +200,37 @@ class EngineOptions:
 
 
 ONE_PROCESS = EngineOptions()
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class RegionOptions:
+    """Calibrations of cores, and what is refused by them."""
+
+    regions: Annotated[list[Path] | None, flag("A core's calibration: its answers get regions; may be repeated.")] = (
+        None
+    )
+    refuse_above: Annotated[float | None, about("Refuse answers whose calibrated 95 % radius is larger, deg.")] = None
+    shifted: Annotated[Literal["widen", "refuse"], about("In unlike frames: the worst region, or none.")] = "widen"
+
+    def read(self) -> "CoreRegions | None":
+        """Return them; None where no calibration is given."""
+        if self.regions is None:
+            if self != NO_REGIONS:
+                raise InputError("--refuse-above and --shifted need --regions")
+            return None
+        from simtest.reconstruction.regions import read_calibrations
+        from simtest.spec.recipes import CoreRegions
+        from simtest.spec.spec_model import validate
+
+        # Files before the work; workers may have another current folder.
+        files = [str(file.resolve()) for file in self.regions]
+        read_calibrations(files)
+        given = {"files": files, "refuse_above_deg": self.refuse_above, "shifted": self.shifted}
+        return validate(CoreRegions, given, "--regions")
+
+
+NO_REGIONS = RegionOptions()
 
 
 @Parameter(name="*")

@@ -2,16 +2,17 @@
 
 import shlex
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter, Token
+from cyclopts import App, Parameter
 
 from simtest.cli.common import (
     ONE_PROCESS,
     OUT,
     AsJson,
+    Distances,
     EngineOptions,
     Out,
     Seed,
@@ -32,7 +33,6 @@ from simtest.cli.common import (
     whole_number,
 )
 from simtest.cli.progress import progress_bar
-from simtest.errors import InputError
 from simtest.runtime.files import check_count
 from simtest.runtime.locks import exclusive_file, exclusive_folder
 
@@ -290,14 +290,6 @@ def _ranges(found: "FittedRecipe") -> "Iterator[str | Table]":
     yield from few([f"left out: {name}: {reason}" for name, reason in found.left_out.items()])
 
 
-def _numbers(_: Any, tokens: Sequence[Token]) -> tuple[float, ...]:
-    """Convert an option to numbers separated by commas."""
-    try:
-        return tuple(float(part) for part in tokens[0].value.split(","))
-    except ValueError:
-        raise ValueError(f"{tokens[0].value!r}: must be numbers separated by commas, such as 20,60") from None
-
-
 @command
 def advise(
     rig: str,
@@ -305,13 +297,7 @@ def advise(
     *,
     out: Out,
     organ: Annotated[str, about("colon, stomach, liver, gallbladder, or plane (a phantom).")] = "colon",
-    distances: Annotated[
-        tuple[float, ...],
-        Parameter(
-            help="Nearest and farthest distance of the wall, mm: 20,60.",
-            negative="", converter=_numbers, n_tokens=1, allow_leading_hyphen=True,
-        ),
-    ] = (20.0, 60.0),
+    distances: Distances = (20.0, 60.0),
     camera: Annotated[Path | None, path("Camera file in place of the scope's camera.")] = None,
     bound: Annotated[float, about("Error beyond which a method counts as broken, deg.")] = 5.0,
     frames: Annotated[
@@ -339,10 +325,7 @@ def advise(
     from simtest.advice.plan import Question
     from simtest.advice.scope import read_scope
 
-    if len(distances) != 2:
-        raise InputError(f"--distances: {len(distances)} numbers; must be two, the nearest and the farthest, mm")
-    scope = read_scope(rig, camera)
-    question = Question(scope, organ, (distances[0], distances[1]), bound, frames, seed or 0)
+    question = Question(read_scope(rig, camera), organ, distances, bound, frames, seed or 0)
     with exclusive_folder(out), progress_bar("writing the page") as progress:
         found = run(question, out, progress, workers)
         page = write_advice(found, out, command_line())

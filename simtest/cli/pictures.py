@@ -11,10 +11,15 @@ from simtest.api import Extras, reconstruct_picture
 from simtest.cli.common import (
     DEFAULTS,
     MOST_ROWS,
+    NO_REGIONS,
+    ONE_PROCESS,
     OUT,
+    Distances,
+    EngineOptions,
     NamedPath,
     Out,
     PictureOptions,
+    RegionOptions,
     Seed,
     Table,
     Told,
@@ -24,6 +29,7 @@ from simtest.cli.common import (
     counted,
     few,
     fixed,
+    flag,
     path,
     whole,
 )
@@ -63,6 +69,7 @@ def reconstruct(
     *,
     out: Annotated[Path | None, path("Folder for the results; default reports/normals/IMAGE.", OUT)] = None,
     known: PictureOptions = DEFAULTS,
+    calibrated: RegionOptions = NO_REGIONS,
     roi: Annotated[str | None, about("Region of interest x,y,w,h in px; default: detected.")] = None,
     extras: Annotated[Extras, Parameter(name="*")] = NO_EXTRAS,
     poses: Annotated[
@@ -88,7 +95,7 @@ def reconstruct(
         raise InputError(f"{image}: --reference, --camera-from-model and --depth are for single pictures")
     if poses and not sequence:
         raise InputError(f"{image}: --poses is for a folder or a film")
-    options = known.checked(roi=None if roi is None else parse_roi(roi), poses=poses)
+    options = known.checked(roi=None if roi is None else parse_roi(roi), poses=poses, regions=calibrated.read())
     if sequence:
         return _sequence(image, out, options)
     spots, files = reconstruct_picture(image, out, options, extras)
@@ -315,7 +322,41 @@ def _twin_cells(each: "SpotTwins") -> list[str]:
     ]  # fmt: skip
 
 
-calibrate = App(name="calibrate", help="Measure what a calibration file states: the positions of the lights.")
+calibrate = App(name="calibrate", help="Measure where the lights are, or how far off a core's normals are.")
+
+
+@calibrate.command(name="core")
+@command
+def core_(
+    core: Annotated[str, about("An estimator by name, 'command: PROGRAM ARGUMENT...' or FILE.toml, as --estimator.")],
+    /,
+    *,
+    scope: Annotated[str, about("A preset or a TOML file, as advise takes it.")],
+    out: Annotated[Path, path("File of the calibration, JSON; answers to the frames stay in a folder beside it.", OUT)],
+    organ: Annotated[str, about("colon, stomach, liver, gallbladder, or plane (a phantom).")] = "colon",
+    distances: Distances = (20.0, 60.0),
+    highlights: Annotated[int, whole("Answers that the calibration stands on, at least.")] = 2400,
+    detector: Annotated[Literal["colour", "peaks"], about("As reconstruct or as validate finds them.")] = "colour",
+    every: Annotated[bool, flag("Take highlights that are not isolated too.", "--all")] = False,
+    seed: Seed = None,
+    engine: EngineOptions = ONE_PROCESS,
+) -> Told:
+    """Find how far off a core's normals are, on rendered frames of your scope: a file for --regions of other commands.
+
+    A stopped calibration goes on.
+    """
+    from simtest.advice.core_calibration import calibrate_core
+    from simtest.advice.plan import Question
+    from simtest.advice.scope import read_scope
+
+    question = Question(read_scope(scope), organ, distances, seed=seed or 0)
+    with exclusive_file(out), progress_bar() as progress:
+        made = calibrate_core(core, question, out, highlights, detector, every, engine.make(), progress)
+    lines = [f"{made.highlights} answers in {made.frames} frames"]
+    for target, strata in made.strata.items():
+        last = [part.error_deg[1] for part in strata.parts]
+        lines.append(f"{target} normals: 95 % within {min(last):.3g} to {max(last):.3g} deg, in {len(last)} strata")
+    return Told([out], made.model_dump(mode="json"), lines)
 
 
 @calibrate.command

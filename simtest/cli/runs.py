@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import App, Parameter
 
 from simtest.cli.common import (
+    NO_REGIONS,
     ONE_PROCESS,
     OUT,
     Address,
@@ -20,6 +21,7 @@ from simtest.cli.common import (
     NamedPath,
     Out,
     Realisations,
+    RegionOptions,
     Seed,
     Settings,
     Table,
@@ -70,6 +72,7 @@ def validate(
     estimators: Estimators = None,
     variant: Variant = None,
     engine: EngineOptions = ONE_PROCESS,
+    calibrated: RegionOptions = NO_REGIONS,
     export: Annotated[Path | None, path("Folder for the frames without their truth, for methods elsewhere.")] = None,
     charts: Annotated[bool, flag("Write the page's charts as PNG files too.")] = False,
 ) -> Told:
@@ -91,6 +94,8 @@ def validate(
         raise InputError(f"{experiment}: is a mesh; use simtest validate mesh --set surface.path={experiment}")
     values = values_of(settings, realisations=realisations, seed=seed, estimators=estimators, viewpoints=views)
     described = load_experiment(experiment, values)
+    if (regions := calibrated.read()) is not None:
+        described = described.model_copy(update={"regions": regions})
     meshes = mesh_verdicts(described)
     for mesh in meshes:
         if not mesh.usable:
@@ -257,6 +262,7 @@ def score(
     name: Annotated[str | None, about("Name of the method in the results; default that of the file.")] = None,
     engine: EngineOptions = ONE_PROCESS,
     how: HowMapsAreRead = NOTHING_STATED,
+    calibrated: RegionOptions = NO_REGIONS,
 ) -> Told:
     """Score normals that were estimated elsewhere on exported frames, as our own estimators are scored.
 
@@ -274,7 +280,7 @@ def score(
 
     folder = out or SCORES / (name or answers.stem)
     with progress_bar() as progress:
-        run = score_table(answers, on, folder, name, command_line(), engine.make(), progress)
+        run = score_table(answers, on, folder, name, command_line(), engine.make(), progress, calibrated.read())
         page = write_report(run.folder, progress)
     return Told(data=lambda: run_record(folder), parts=[lambda: print_guide(folder), page])
 
@@ -415,6 +421,7 @@ def run(
     parts: Annotated[list[str] | None, flag("Run this part alone; may be repeated.", "--part")] = None,
     suite: SuiteVersion = "v1",
     engine: EngineOptions = ONE_PROCESS,
+    calibrated: RegionOptions = NO_REGIONS,
 ) -> Told:
     """Run a core on the frozen cases; print its table and write certificate.json. A stopped run goes on."""
     from simtest.bench.run import run_bench, run_maps
@@ -431,7 +438,7 @@ def run(
             made = run_maps(read, maps or "", out, how.named(name), chosen, progress)
         else:
             how.refuse(name=name)
-            made = run_bench(read, core, out, parts, chosen, progress)
+            made = run_bench(read, core, out, parts, chosen, progress, regions=calibrated.read())
     return Told([made.certificate], made.content, _part_rows(made.content))
 
 

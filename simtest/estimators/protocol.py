@@ -52,6 +52,15 @@ class EstimatedCurvature:
 
 
 @dataclass(frozen=True)
+class CalibratedRegion:
+    """How far off 68 and 95 % of such answers are at most, deg, and what says so (`simtest calibrate core`)."""
+
+    radius_68_deg: float
+    radius_95_deg: float
+    region_source: str
+
+
+@dataclass(frozen=True)
 class Estimate:
     """A reconstructed normal.
 
@@ -86,6 +95,8 @@ class Estimate:
         section 7).
     cloud : CloudShape, optional
         The cloud of highlights that the estimate stands on, where it is not that of a single one.
+    calibrated : CalibratedRegion, optional
+        Regions by the core's calibration, where one was given.
 
     Examples
     --------
@@ -109,6 +120,7 @@ class Estimate:
     target: Target = "fine"
     cloud: CloudShape | None = None
     axis_ratio_deviation: float | None = None
+    calibrated: CalibratedRegion | None = None
 
     def __post_init__(self) -> None:
         if self.budget is not None and self.covariance is None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.realism.frames import NamedFrame
-from simtest.realism.statistics import COLUMNS, STATISTICS, Measured, Statistic, measure
+from simtest.reconstruction.statistics import COLUMNS, STATISTICS, Measured, Statistic, measure
 from simtest.runtime.arrays import Array, Image, IntArray, Picture
 from simtest.runtime.files import Json
 from simtest.runtime.seeds import from_integer

@@ -24,7 +24,7 @@ from simtest.realism.compare import (
     mean_distribution,
     plain,
 )
-from simtest.realism.statistics import STATISTICS, FrameColumn, Statistic
+from simtest.reconstruction.statistics import STATISTICS, FrameColumn, Statistic
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array, Picture
 from simtest.runtime.files import make_folder, write_atomically, write_json, written_together

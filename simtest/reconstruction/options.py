@@ -7,6 +7,7 @@ any scale, unless an encoding is given: then they are those of a picture, in [0,
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,6 +33,9 @@ from simtest.reconstruction.assumptions import (
 from simtest.reconstruction.images import check_roi, is_coloured
 from simtest.runtime.arrays import Image, short_repr
 from simtest.runtime.boundary import shown
+
+if TYPE_CHECKING:
+    from simtest.spec.recipes import CoreRegions
 
 AUTO = "auto"
 ENCODINGS = ("srgb", "linear")
@@ -83,6 +87,8 @@ class Options:
         Found by colour, take text and squares that are drawn on the picture for tissue.
     least_score : float, optional
         Highlights with a smaller score have no best normal; 0 keeps all. Default `LEAST_SCORE`.
+    regions : CoreRegions, optional
+        Calibrations of cores (`simtest calibrate core`), whose answers then have regions of 68 and 95 %.
     """
 
     camera: Path | None = None
@@ -98,6 +104,7 @@ class Options:
     poses: Path | None = None
     keep_overlays: bool = False
     least_score: float | None = None
+    regions: "CoreRegions | None" = None
 
     def __post_init__(self) -> None:
         if isinstance(self.detector, str) and self.detector != AUTO:

@@ -28,6 +28,9 @@ COLUMNS = (
     "score", "target", "deviation_deg", "organ_deviation_deg",
 )  # fmt: skip
 
+REGION_COLUMNS = ("radius_68_deg", "radius_95_deg", "region_source")
+"""Further ones where a core's calibration is given."""
+
 FILES = ("normals.json", "normals.csv", "normals.ply", "overlay.png", "constraints.npz", "index.html")
 
 
@@ -46,9 +49,9 @@ def write_outputs(
     make_folder(out)
     with written_together(out, FILES) as new:
         write_json(new / "normals.json", entries, compact=len(found) > MANY)
-        write_atomically(
-            new / "normals.csv", lambda part: write_csv(part, COLUMNS, normals_rows(entries["specularities"]))
-        )
+        spots = entries["specularities"]
+        columns = columns_of(spots)
+        write_atomically(new / "normals.csv", lambda part: write_csv(part, columns, normals_rows(spots, columns)))
         write_atomically(new / "normals.ply", lambda part: part.write_text(points, encoding="ascii"))
         # In memory: OpenCV does not tell which of the system's errors it met.
         overlay = cv2.imencode(".png", draw_overlay(picture, found))[1].tobytes()
@@ -58,8 +61,15 @@ def write_outputs(
     return [out / name for name in FILES]
 
 
-def normals_rows(entries: Iterable[JsonObject]) -> Iterator[tuple[object, ...]]:
-    """Yield a row of `COLUMNS` for each entry of ``specularities``, estimator and candidate; 0 is the proposed one."""
+def columns_of(entries: Sequence[JsonObject]) -> tuple[str, ...]:
+    """Return the columns of a table of entries of ``specularities``."""
+    held = any(REGION_COLUMNS[0] in each for entry in entries for each in entry["estimates"].values())
+    return (*COLUMNS, *REGION_COLUMNS) if held else COLUMNS
+
+
+def normals_rows(entries: Iterable[JsonObject], columns: Sequence[str] = COLUMNS) -> Iterator[tuple[object, ...]]:
+    """Yield a row of the columns for each entry of ``specularities``, estimator and candidate, 0 the proposed one."""
+    others = columns[len(COLUMNS) :]
     for entry in entries:
         peak = (None, None) if entry["peak_px"] is None else (float(v) for v in entry["peak_px"])
         judged = (*peak, entry.get("kind"), entry.get("score"))
@@ -68,7 +78,8 @@ def normals_rows(entries: Iterable[JsonObject]) -> Iterator[tuple[object, ...]]:
             covariance, deviation, organ = (None,) * 3, None, None
             if each["status"] != "ok":
                 # candidate, normal, look and axis ratio; then margin
-                yield (*start, *(None,) * 7, "", best, None, *covariance, *judged, None, deviation, organ)
+                yield (*start, *(None,) * 7, "", best, None, *covariance, *judged, None, deviation, organ,
+                       *(None,) * len(others))  # fmt: skip
                 continue
             if each["covariance"] is not None:
                 matrix = np.array(each["covariance"])
@@ -77,7 +88,8 @@ def normals_rows(entries: Iterable[JsonObject]) -> Iterator[tuple[object, ...]]:
                 organ = deviation_deg(np.array(each["organ_covariance"]))
             shape = (*each["look_px"], each["axis_ratio"], ";".join(each["flags"]), best, each["choice_margin"])
             for k, normal in enumerate(np.array(each["candidates"]).tolist()):
-                yield (*start, k, *normal, *shape, *covariance, *judged, each["target"], deviation, organ)
+                yield (*start, k, *normal, *shape, *covariance, *judged, each["target"], deviation, organ,
+                       *map(each.get, others))  # fmt: skip
 
 
 def write_csv(path: Path, columns: Sequence[str], table: Iterable[Sequence[object]]) -> None:

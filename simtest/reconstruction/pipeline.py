@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +34,9 @@ from simtest.runtime.arrays import Array, Image
 from simtest.runtime.boundary import plain_errors
 from simtest.runtime.messages import LOGGER
 
+if TYPE_CHECKING:
+    from simtest.spec.recipes import CoreRegions
+
 LEAST_HEIGHT = 6.0
 """A user's region holds a highlight if its peak is so many standard deviations of the smoothed noise above its median:
 noise alone reaches 6 in one of 10^5 regions. What is detected stands out far more."""
@@ -60,6 +64,7 @@ def reconstruct(
     encoding: str | None = None,
     keep_overlays: bool = False,
     least_score: float | None = None,
+    regions: "CoreRegions | str | Path | None" = None,
 ) -> Specularities:
     """Reconstruct the normals at a frame's isolated specularities.
 
@@ -102,6 +107,8 @@ def reconstruct(
         Found by colour, take text and squares that are drawn on the picture for tissue; default: they are masked.
     least_score : float, optional
         Highlights with a smaller score, which may be none, have no best normal; 0 keeps all. Default `LEAST_SCORE`.
+    regions : path or CoreRegions, optional
+        A core's calibration (`simtest calibrate core`): its answers have regions of 68 and 95 % (`calibrated`).
 
     Returns
     -------
@@ -145,9 +152,14 @@ def reconstruct(
         check_size(image, camera.camera)
     else:
         image, is_picture = check_frame(frame, camera.camera, encoding)
+    if isinstance(regions, str | Path):
+        from simtest.spec.recipes import CoreRegions
+
+        regions = CoreRegions(files=(str(regions),))
     options = Options(
         estimators=estimators, roi=roi, encoding=encoding, every=not isolated, detector=detector,
         smoothing_px=smoothing_px, target=target, keep_overlays=bool(keep_overlays), least_score=least_score,
+        regions=regions,
     )  # fmt: skip
     spots = run(image, camera, options, is_picture)
     spots.image, spots.warnings = name, cautions
@@ -191,6 +203,10 @@ def run(image: Image, calibration: Calibration, options: Options, is_picture: bo
     # estimate
     spots, no_cloud = _estimate(detection, chosen, beside, options)
     numbered = [replace(spot, id=i) for i, spot in enumerate(spots)]
+    if options.regions is not None:
+        from simtest.reconstruction.regions import with_regions
+
+        numbered = with_regions(numbered, image, choices, options.every, options.regions)
     return Specularities(numbered, detection, choices, no_cloud=no_cloud)
 
 

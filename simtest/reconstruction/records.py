@@ -5,7 +5,7 @@ docs/howto/pictures.md explains the keys of their JSON. It is what the tables, t
 
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -381,10 +381,11 @@ class Specularities(list[Specularity]):
         """Return the table of normals.csv: a row for each specularity, estimator and candidate, 0 the proposed one."""
         import polars as pl
 
-        from simtest.reconstruction.outputs import COLUMNS, normals_rows
+        from simtest.reconstruction.outputs import columns_of, normals_rows
 
         entries = [spot.to_json(drawn=False) for spot in self]
-        return pl.DataFrame([*normals_rows(entries)], schema=list(COLUMNS), orient="row", infer_schema_length=None)
+        names = columns_of(entries)
+        return pl.DataFrame([*normals_rows(entries, names)], schema=[*names], orient="row", infer_schema_length=None)
 
     def __repr__(self) -> str:
         answered = sum(each.best is not None for each in self)
@@ -544,6 +545,8 @@ def _estimate_json(result: Estimate | Failure, drawing: Drawing | None, organ: E
         entry["axis_ratio_deviation"] = result.axis_ratio_deviation
     if (shape := result.curvature) is not None:
         entry["curvature"] = {"directions": shape.directions, "axis_ratio": shape.axis_ratio, "gains": shape.hypotheses}
+    if result.calibrated is not None:
+        entry |= asdict(result.calibrated)
     if drawing is not None:
         entry["isophotes"] = [{"t": t, "points": points} for t, points in drawing.isophotes]
         entry["ellipses"] = [isophote.conic.image for isophote in result.isophotes if isophote.conic is not None]

@@ -36,7 +36,7 @@ from simtest.reconstruction.motion import (
     motion_row,
 )
 from simtest.reconstruction.options import Options, calibration_for, default_estimators, stated_calibration
-from simtest.reconstruction.outputs import COLUMNS, normals_rows, write_csv
+from simtest.reconstruction.outputs import COLUMNS, REGION_COLUMNS, normals_rows, write_csv
 from simtest.reconstruction.overlay import draw_overlay
 from simtest.reconstruction.page import write_sequence_page
 from simtest.reconstruction.pipeline import reconstruct_values
@@ -54,7 +54,7 @@ SETTINGS = "run.json"
 MOST_NAMES = 3
 """Pictures of another size than the camera's that a refusal names, of each size."""
 
-TIMELINE = ("frame", "time_s", "track", *COLUMNS)
+TIMELINE = ("frame", "time_s", "track")
 
 
 @dataclass(frozen=True)
@@ -302,7 +302,7 @@ def _read_done(path: Path, name: str) -> JsonObject | None:
     try:
         entry: JsonObject = read_json(path)
         # The tables, the tracks and the motion need what a frame's file must hold.
-        tuple(_rows(entry))
+        tuple(_rows(entry, COLUMNS))
         np.asarray(_positions(entry), dtype=float).reshape(-1, 2)
         for spot in entry["specularities"]:
             TrackedHighlight.from_json(0, spot)
@@ -361,7 +361,8 @@ def _told_by_motion(judged: Sequence[MotionRecord], poses: Poses, is_flipped: bo
 
 def _settings(source: Path, options: Options, calibration: Calibration | None) -> JsonObject:
     """Return the run's settings, through JSON, so that paths and tuples compare with the text and lists of a file."""
-    given = {key: value for key, value in asdict(options).items() if key != "poses" or value is not None}
+    later = ("poses", "regions")
+    given = {key: value for key, value in asdict(options).items() if key not in later or value is not None}
     if calibration is not None:
         content = json.dumps(asdict(calibration), default=str)
         given["calibration"] = hashlib.sha256(content.encode()).hexdigest()
@@ -389,18 +390,19 @@ def _check_settings(path: Path, settings: JsonObject) -> None:
 def _write(run: _Run, tracks: Sequence[Track]) -> list[Path]:
     judged = any(track.shapes for track in tracks)
     files = [run.out / name for name in ("timeline.csv", "tracks.json", "index.html")]
-    columns = (*TIMELINE, *MOTION_COLUMNS) if judged else TIMELINE
+    of_normals = COLUMNS if run.options.regions is None else (*COLUMNS, *REGION_COLUMNS)
+    columns = (*TIMELINE, *of_normals, *(MOTION_COLUMNS if judged else ()))
     # One frame's file after the other: a film's rows do not fit into memory.
-    rows = (row for frame in run.frames for row in _rows(read_json(run.file(frame.index))))
+    rows = (row for frame in run.frames for row in _rows(read_json(run.file(frame.index)), of_normals))
     write_atomically(files[0], lambda part: write_csv(part, columns, rows))
     write_json(files[1], tracks, compact=True)
     write_atomically(files[2], lambda part: write_sequence_page(part, run.frames, tracks))
     return files
 
 
-def _rows(frame: JsonObject) -> Iterator[tuple[object, ...]]:
+def _rows(frame: JsonObject, columns: Sequence[str]) -> Iterator[tuple[object, ...]]:
     """Yield the rows of timeline.csv of a frame's file."""
     for entry in frame["specularities"]:
         motion = motion_row(entry["motion"]) if "motion" in entry else ()
-        for row in normals_rows([entry]):
+        for row in normals_rows([entry], columns):
             yield (frame["frame_index"], frame["time_s"], entry["track"], *row, *motion)

@@ -21,7 +21,7 @@ from simtest.runtime.boundary import plain_errors, suggestion
 from simtest.runtime.resources import find
 from simtest.spec.keys import replace_values, rivals
 from simtest.spec.scene import Scene
-from simtest.spec.spec_model import Name, Share, Spec, load, validate
+from simtest.spec.spec_model import UNSAID, Name, Share, Spec, load, validate
 from simtest.spec.toml_files import as_settings, read_toml
 
 
@@ -147,6 +147,14 @@ class Group(Spec):
         return self
 
 
+class CoreRegions(Spec):
+    """Calibrations of cores (`simtest calibrate core`), whose answers then have regions of 68 and 95 %."""
+
+    files: tuple[str, ...] = Field(min_length=1)
+    refuse_above_deg: float | None = Field(None, gt=0, le=180, description="answers with a larger one are refused")
+    shifted: Literal["widen", "refuse"] = Field("widen", description="answers in frames unlike the calibration's")
+
+
 class Experiment(Spec):
     """A validation experiment.
 
@@ -165,6 +173,7 @@ class Experiment(Spec):
     seed: int = Field(0, ge=0, lt=2**63)
     estimators: tuple[str, ...] = Field(("circle_pose", "brightest_point", "cone_axis"), min_length=1)
     groups: tuple[Group, ...] = Field(min_length=1)
+    regions: CoreRegions | None = Field(None, description="calibrations of its cores; default none", **UNSAID)
 
     __repr__ = short_repr
     __str__ = short_repr

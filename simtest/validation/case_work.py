@@ -178,7 +178,7 @@ def by_variant(jobs: Sequence[Job]) -> list[Job]:
 
 def _parts(job: Job, missing: Sequence[int]) -> list[tuple[CaseOf, Part]]:
     """Split the missing cases of a job into parts, which an engine may run in any order."""
-    in_gallery, swept = gallery_cases(job.cases), swept_example(job.cases)
+    in_gallery, swept = gallery_cases(job.cases), swept_example(job.cases, job.experiment.regions)
     # A worker, on another machine of a cluster for one, may have another current folder.
     absolute = absolute_names(job.experiment.estimators)
     experiment = job.experiment.model_copy(update={"estimators": absolute})

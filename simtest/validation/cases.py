@@ -15,7 +15,7 @@ from simtest.runtime.resources import find
 from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, Uniform, apply_settings, read_toml, scene_from_dict
 from simtest.spec.keys import replace_values
-from simtest.spec.recipes import PaperSetting, is_paper, paper_from_dict
+from simtest.spec.recipes import CoreRegions, PaperSetting, is_paper, paper_from_dict
 from simtest.spec.toml_files import toml_value
 from simtest.surfaces.recipe import load_recipe
 
@@ -284,9 +284,11 @@ def _toml(value: Json) -> str:
     return value if isinstance(value, str) else toml_value(value)
 
 
-def swept_example(cases: list[Case]) -> "dict[str, Value]":
+def swept_example(cases: list[Case], regions: CoreRegions | None = None) -> "dict[str, Value]":
     """Return an example value for each swept, pooled or drawn parameter: the columns that results gain."""
     example: dict[str, Value] = {}
+    if regions is not None:
+        example |= {"radius_68_deg": 0.0, "radius_95_deg": 0.0, "region_source": ""}
     for case in cases:
         example |= case.swept
         example |= dict.fromkeys(case.random, 0.0)

@@ -14,11 +14,12 @@ from simtest.validation.cases import Case
 
 def fingerprint(experiment: Experiment, cases: list[Case], variant: str) -> str:
     """Return a hash of everything that determines a run's results."""
+    calibrations = () if experiment.regions is None else experiment.regions.files
     return _hash(
         {
             "experiment": experiment.model_dump(mode="json"),
             "scenes": [case.data for case in cases],
-            "inputs": input_hashes(cases),
+            "inputs": input_hashes(cases) | {each: provenance.file_hash(Path(each)) for each in calibrations},
             "versions": provenance.versions() | ESTIMATORS.distributions(experiment.estimators),
             "cores": core_hashes(experiment.estimators),
             "source": provenance.source_hash(),

@@ -15,6 +15,7 @@ from simtest.runtime.arrays import Image, Picture, only_reading
 from simtest.simulation.frame import RenderedView, render_view
 from simtest.simulation.highlights import TrueHighlight
 from simtest.spec import Experiment
+from simtest.spec.recipes import CoreRegions
 from simtest.validation.cases import Case, swept_example
 from simtest.validation.columns import Row, Value, swept_columns, table
 from simtest.validation.glints import rough_truth
@@ -78,12 +79,13 @@ class Scored:
 
 
 def answer(
-    view: RenderedView, frame: Image | Picture, estimators: Mapping[str, AnyEstimator], isolated: bool = True
-) -> list[Specularity]:
+    view: RenderedView, frame: Image | Picture, estimators: Mapping[str, AnyEstimator], isolated: bool = True,
+    regions: CoreRegions | None = None,
+) -> list[Specularity]:  # fmt: skip
     """Reconstruct a view's frame by what is known of it; without light whatever would be found is noise."""
     if view.full_scale <= 0:
         return []
-    return reconstruct(frame, view.calibration, estimators, isolated=isolated, detector="peaks")
+    return reconstruct(frame, view.calibration, estimators, isolated=isolated, detector="peaks", regions=regions)
 
 
 def score(
@@ -181,7 +183,7 @@ def realise(
     """
     seed = case.noise_seed(experiment, number)
     frame = view.frame(seed)
-    specularities = answer(view, frame, estimators, case.isolated)
+    specularities = answer(view, frame, estimators, case.isolated, experiment.regions)
     motion = with_motion(experiment, case, number, view, further, specularities) if further else None
     specularities = specularities if motion is None else motion.specularities
     common: Row = {
@@ -201,7 +203,7 @@ def keep_frame(path: Path, session: Session, experiment: Experiment, case: Case,
     """Keep the frame of a realisation, at whose scene the session must be."""
     scene = realisation.view.scene
     # Errors and counts are those of the results: a cloud's truth is the base's, and none of the highlights here.
-    held = table(realisation.rows, swept_example([case]))
+    held = table(realisation.rows, swept_example([case], experiment.regions))
     rows = {
         (row["specularity"], row["estimator"]): {name: row[name] for name in ("kind", "error_deg", "error_oracle_deg")}
         for row in held.with_columns(kind=row_kind(held)).iter_rows(named=True)

@@ -5,7 +5,7 @@ Detections come from the frame alone; each estimator has a row at each detected 
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -249,6 +249,7 @@ def estimate_columns(estimate: Estimate) -> Row:
         **{f"budget_{name}_deg": float(np.degrees(sd)) for name, sd in deviations(estimate.budget or {}).items()},
         "gain_1": None if gains is None else float(gains[0]),
         "gain_2": None if gains is None else float(gains[1]),
+        **({} if estimate.calibrated is None else asdict(estimate.calibrated)),
     }
 
 

@@ -15,7 +15,7 @@ from simtest.bench.suite import CaseSpec, pooled
 from simtest.dataset.plan import Plan
 from simtest.realism.compare import distances
 from simtest.realism.fitting.bank import FrameMaker
-from simtest.realism.statistics import COLUMNS
+from simtest.reconstruction.statistics import COLUMNS
 from simtest.runtime.resources import data_root
 from simtest.runtime.seeds import Stage, from_integer, generator, integer
 from simtest.simulation.sensor import capture

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from simtest.realism.compare import distances
-from simtest.realism.statistics import COLUMNS, STATISTICS
+from simtest.reconstruction.statistics import COLUMNS, STATISTICS
 
 SINGLE = {s.columns[0].name for s in STATISTICS if len(s.columns) == 1}
 CALLS = 20

@@ -35,7 +35,7 @@ from simtest.realism.fitting.fit import (
 )
 from simtest.realism.fitting.inference import FOLDS, PENALTIES, features, learn
 from simtest.realism.frames import open_frames
-from simtest.realism.statistics import COLUMNS, NAMES, summarise
+from simtest.reconstruction.statistics import COLUMNS, NAMES, summarise
 from simtest.runtime.seeds import from_integer
 from simtest.spec.recipes import Dataset, Distribution, load_dataset
 from simtest.spec.spec_model import validate

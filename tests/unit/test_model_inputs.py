@@ -12,6 +12,7 @@ import pytest
 import simtest.advice.scope
 import simtest.bench.suite
 import simtest.estimators.process.core
+import simtest.reconstruction.regions
 import simtest.spec.calibration_spec
 import simtest.surfaces.recipe  # noqa: F401  (these modules hold models)
 from simtest.errors import InputError
@@ -125,8 +126,11 @@ def good(form, definitions):
     if kind == "object":
         told = form.get("properties", {})
         needed = {*form.get("required", []), *(key for key in told if key == "type")}
+        if form.get("minProperties"):
+            told = {key: form["additionalProperties"] for key in form["propertyNames"]["enum"]}
+            needed = {*told}
         return {key: good(forms(told[key], definitions)[0], definitions) for key in sorted(needed)}
-    return "a"
+    return False if kind == "boolean" else "a"
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -20,7 +20,7 @@ from simtest.realism import frames as realism_frames
 from simtest.realism.compare import compare, distances
 from simtest.realism.fitting.bank import FrameMaker, one_family
 from simtest.realism.frames import NamedFrame, open_frames, open_generated, rendered_frames, varied
-from simtest.realism.statistics import COLUMNS, STATISTICS, measure
+from simtest.reconstruction.statistics import COLUMNS, STATISTICS, measure
 from simtest.rendering.backend import colour_variant
 from simtest.runtime.arrays import kept
 from simtest.runtime.processes import make_engine

@@ -15,8 +15,8 @@ from simtest.pages.charts import png
 from simtest.realism.compare import Comparison, SetOfFrames, compare, distances, mean_distribution
 from simtest.realism.frames import NamedFrame, _Film, open_frames
 from simtest.realism.page import distance_chart, distribution_charts, write_comparison
-from simtest.realism.statistics import COLUMNS
 from simtest.reconstruction.images import Source, open_source
+from simtest.reconstruction.statistics import COLUMNS
 
 
 def frame(seed, spots=4, size=(96, 128)):

@@ -455,7 +455,7 @@ def test_highlights_of_a_frame_that_the_detector_refuses_are_missed(monkeypatch)
         def detect(self, frame, camera, priors):
             return Detection((), frame, refusal=Failure(Reason.NO_ESTIMATE, "unlike the training"))
 
-    def refused(frame, calibration, estimators, isolated, detector):
+    def refused(frame, calibration, estimators, isolated, detector, regions):
         return reconstruct(frame, calibration, estimators, smoothing_px=2.0, detector=Refusing())
 
     monkeypatch.setattr("simtest.validation.realisation.reconstruct", refused)

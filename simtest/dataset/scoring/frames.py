@@ -26,7 +26,7 @@ from simtest.runtime.arrays import Image
 from simtest.runtime.files import read_json, require_plain, write_json
 from simtest.simulation.frame import RenderedView
 from simtest.spec import Experiment, Scene
-from simtest.spec.recipes import Dataset
+from simtest.spec.recipes import CoreRegions, Dataset
 from simtest.spec.sensor import Sensor
 from simtest.spec.spec_model import validate
 from simtest.validation.case_work import gallery_cases, realiser_of
@@ -329,7 +329,16 @@ class Source:
     @property
     def swept_example(self) -> Mapping[str, Value]:
         """An example of each value that results gain a column for."""
-        return swept_example(list(self.cases)) if self.cases else {ON_INSTRUMENT: False, ANATOMY: ""}
+        if isinstance(self.recipe, Experiment):
+            return swept_example(list(self.cases), self.recipe.regions)
+        return {ON_INSTRUMENT: False, ANATOMY: ""}
+
+    def with_regions(self, regions: CoreRegions) -> "Source":
+        """Return it with the calibration by which answers get regions; raise `InputError` for a dataset."""
+        if not isinstance(self.recipe, Experiment):
+            raise InputError(f"{self.folder}: is a dataset; --regions is for answers to the frames of a run")
+        recipe = self.recipe.model_copy(update={"regions": regions})
+        return replace(self, recipe=recipe, parts=frames_of_cases(recipe, self.cases, self.variant))
 
     def summary(self, results: pl.DataFrame, described: Mapping[str, str]) -> ExperimentSummary:
         """Return what summary.json says of results; `described` are the estimators."""

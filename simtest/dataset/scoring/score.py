@@ -28,6 +28,7 @@ from simtest.runtime.files import are_nested
 from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.processes import Engine, OnStep, make_engine
 from simtest.spec import Experiment
+from simtest.spec.recipes import CoreRegions
 from simtest.validation.case_work import forget
 from simtest.validation.columns import Row, Value
 from simtest.validation.columns import table as results_table
@@ -52,7 +53,7 @@ class ScorePart:
 
 def score_table(
     table: Path, on: Path, out: Path, name: str | None = None, command: str = "", engine: Engine | None = None,
-    progress: Progress | None = None,
+    progress: Progress | None = None, regions: CoreRegions | None = None,
 ) -> Run:  # fmt: skip
     """Score a table of answers to the exported frames of a run or dataset.
 
@@ -72,6 +73,8 @@ def score_table(
         Runs the tasks; by default this process does. The rows do not depend on it.
     progress : callable, optional
         Called with frames done, frames in all, and what is being done.
+    regions : CoreRegions, optional
+        The method's calibration.
 
     Returns
     -------
@@ -84,6 +87,8 @@ def score_table(
     record = read_record(on)
     answers = read_answers(table, record, method)
     source = open_source(on, record)
+    if regions is not None:
+        source = source.with_regions(regions)
     if are_nested(on, out):
         raise InputError(f"--out {out}: must be neither the run that is scored on nor inside or around it")
     if (out / EXPORT).exists():

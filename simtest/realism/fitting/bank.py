@@ -14,7 +14,7 @@ from pydantic import JsonValue
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.errors import InputError
 from simtest.realism.compare import Progress
-from simtest.realism.statistics import NAMES, measure, summarise
+from simtest.reconstruction.statistics import NAMES, measure, summarise
 from simtest.runtime.arrays import Array, Image, IntArray, only_reading
 from simtest.runtime.files import Json, make_folder, read_json, write_json
 from simtest.runtime.provenance import source_hash

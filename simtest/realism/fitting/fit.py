@@ -21,7 +21,7 @@ from simtest.realism.fitting.bank import (
 )
 from simtest.realism.fitting.inference import REPEATS, Emulator, Fitted, infer, learn
 from simtest.realism.frames import NamedFrame
-from simtest.realism.statistics import NAMES, measure, summarise
+from simtest.reconstruction.statistics import NAMES, measure, summarise
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import Json, write_atomically, write_json, written_together
 from simtest.runtime.seeds import from_integer

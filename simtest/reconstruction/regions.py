@@ -1,0 +1,244 @@
+"""Regions of 68 and 95 % for the normals of any core, by what its calibration on rendered frames found.
+
+`simtest calibrate core` writes the file (`simtest.advice.core_calibration`). It parts the answers into strata by what
+can be seen without the truth, and states of each how large the errors of 68 and 95 % of the answers were at most, over
+a scale: the standard deviation that the core reports, its root, or what is expected of such a highlight. Frames unlike
+those of the calibration, by the statistics that realism is measured by, get the region of the worst stratum, or none.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import Field, JsonValue
+
+from simtest.conventions import HIGHLIGHT_ISOVALUE
+from simtest.detection.detector import Kind
+from simtest.errors import Failure, InputError, Reason
+from simtest.estimators import Estimate
+from simtest.estimators.protocol import CalibratedRegion, Target
+from simtest.reconstruction.images import is_coloured
+from simtest.reconstruction.options import Choices
+from simtest.reconstruction.statistics import LEAST_SIDE, NAMES, measure, summarise
+from simtest.runtime.arrays import Array, Image
+from simtest.runtime.files import read_json
+from simtest.spec.recipes import CoreRegions
+from simtest.spec.spec_model import Spec, validate
+
+if TYPE_CHECKING:
+    from simtest.reconstruction.records import Specularity
+
+LEVELS = (0.68, 0.95)
+MOST_DEG, REGRESSORS = 180.0, 11
+
+Format = Literal["simtest core calibration, version 1"]
+Feature = Literal["sigma_deg", "axis_ratio", "score", "radius_px", "border", "flags", "kind"]
+Ends = dict[Feature, tuple[float | None, float | None]]
+"""What features are at least, and below."""
+
+ScaleKind = Literal["one", "reported", "root", "expected"]
+Positive = Annotated[float, Field(ge=0)]
+Radii = tuple[Positive, Positive]
+"""At 68 and at 95 %."""
+
+Statistics = Annotated[tuple[float, ...], Field(min_length=len(NAMES), max_length=len(NAMES))]
+Numbers = Annotated[tuple[float, ...], Field(min_length=REGRESSORS, max_length=REGRESSORS)]
+Seen = Mapping[Feature, float] | Mapping[Feature, Array]
+"""Features of an answer, or of several."""
+
+
+def features(spot: "Specularity", estimate: Estimate, size: tuple[int, int]) -> dict[Feature, float]:
+    """Return what strata are made by: all of it can be seen without the truth.
+
+    -1 stands for what is not reported; `border` is the peak's distance to the frame's over its width, `flags` their
+    number, `kind` the number of the kind.
+    """
+    patch, (x, y), (width, height) = spot.patch, spot.position_px, size
+    area = 0.0 if isinstance(patch, Failure) else float(np.count_nonzero(patch.inside(HIGHLIGHT_ISOVALUE, cut=True)))
+    return {
+        "sigma_deg": -1.0 if estimate.deviation_deg is None else estimate.deviation_deg,
+        "axis_ratio": -1.0 if estimate.axis_ratio is None else estimate.axis_ratio,
+        "score": -1.0 if spot.score is None else spot.score,
+        "radius_px": math.sqrt(area / math.pi),
+        "border": max(float(min(x, y, width - x, height - y)), 0.0) / width,
+        "flags": float(len(estimate.flags)),
+        "kind": -1.0 if spot.kind is None else float([*Kind].index(Kind(spot.kind))),
+    }
+
+
+def regressors(seen: Seen) -> Array:
+    """Return what the expected error depends on, shape (..., R)."""
+    sigma, ratio, score, radius = (np.asarray(seen[each]) for each in ("sigma_deg", "axis_ratio", "score", "radius_px"))
+    reported = np.where(sigma > 0, np.log(np.maximum(sigma, 0.01)), 0.0)
+    bent = np.stack([reported, score, np.log(np.maximum(radius, 0.5)), ratio], axis=-1)
+    others = np.stack([ratio < 0, np.asarray(seen["flags"]), np.minimum(seen["border"], 0.2)], axis=-1)
+    return np.concatenate([bent, bent**2, others], axis=-1)
+
+
+# The file -------------------------------------------------------------------------------------------------------------
+
+
+class Expected(Spec):
+    """The error that is expected of an answer by its features: the exponential of a linear form of `regressors`."""
+
+    centre: Numbers
+    spread: Numbers
+    weights: Numbers = Field(description="of the regressors less the centre, over the spread, within 3 of them")
+    start: float
+
+    def of(self, seen: Seen) -> Array:
+        """Return it for answers with these features, deg."""
+        scaled = (regressors(seen) - np.array(self.centre)) / np.array(self.spread)
+        return np.asarray(np.exp(self.start + np.clip(scaled, -3, 3) @ np.array(self.weights)))
+
+
+class Stratum(Spec):
+    """Answers that are alike by what can be seen, and how large the errors of 68 and 95 % of them are at most."""
+
+    ends: Ends
+    highlights: int = Field(ge=1, description="it stands on")
+    frames: int = Field(ge=1, description="that these are of")
+    ratio: Radii = Field(description="errors over the scale")
+    error_deg: Radii
+
+    def holds(self, seen: Mapping[Feature, float]) -> bool:
+        """Return whether an answer with these features belongs to it."""
+        return all(
+            (low is None or seen[name] >= low) and (high is None or seen[name] < high)
+            for name, (low, high) in self.ends.items()
+        )
+
+
+class Strata(Spec):
+    """What was found of the normals of one surface."""
+
+    scale: ScaleKind = Field(description="over which errors are alike: one, reported deviation, its root, or expected")
+    expected: Expected
+    parts: tuple[Stratum, ...] = Field(min_length=1)
+
+    def region(self, seen: Mapping[Feature, float], outside: bool) -> Radii:
+        """Return the region of an answer, deg.
+
+        Outside of the calibration, or without the deviation that the scale is of, it is that of the worst part.
+        """
+        scale = float(scales(seen, self.expected)[self.scale])
+        own = [each for each in self.parts if each.holds(seen)]
+        if outside or not own or not scale > 0:
+            held = [each.error_deg for each in self.parts]
+            held += [(scale * each.ratio[0], scale * each.ratio[1]) for each in self.parts if scale > 0]
+        else:
+            held = [(scale * own[0].ratio[0], scale * own[0].ratio[1])]
+        return min(max(each for each, _ in held), MOST_DEG), min(max(each for _, each in held), MOST_DEG)
+
+
+def scales(seen: Seen, expected: Expected) -> dict[ScaleKind, Array]:
+    """Return the scales that errors may be divided by; NaN where the core reports no deviation."""
+    sigma = np.asarray(seen["sigma_deg"], dtype=float)
+    reported = np.where(sigma > 0, sigma, np.nan)
+    return {
+        "one": np.ones_like(sigma), "reported": reported, "root": np.sqrt(reported), "expected": expected.of(seen),
+    }  # fmt: skip
+
+
+class Shift(Spec):
+    """Where the frames' statistics lie, what takes them to unit covariance, and how far off at most 5 % are."""
+
+    centre: Statistics
+    whitening: Annotated[tuple[Statistics, ...], Field(min_length=len(NAMES), max_length=len(NAMES))]
+    limit: Positive
+
+    def distance(self, statistics: Array) -> float:
+        """Return how far off a frame is, in standard deviations; what it does not tell counts as the centre."""
+        off = np.nan_to_num(statistics - np.array(self.centre), nan=0.0)
+        return float(np.linalg.norm(np.array(self.whitening) @ off))
+
+
+class CoreCalibration(Spec):
+    """What was found of a core on frames of a scope."""
+
+    format: Format = "simtest core calibration, version 1"
+    core: str = Field(min_length=1, description="its name in results")
+    scope: str
+    size: tuple[int, int] = Field(description="of the frames, px")
+    detector: Literal["colour", "peaks"]
+    every: bool = Field(description="whether highlights were taken that are not isolated")
+    highlights: int = Field(ge=1, description="answers in all")
+    frames: int = Field(ge=1, description="that these are of")
+    strata: dict[Target, Strata] = Field(min_length=1, description="by the surface whose normal is stated")
+    shift: Shift | None = Field(description="None where the frames are grey")
+    made: dict[str, JsonValue] = Field(description="of what, and with which versions")
+
+    def outside(self, image: Image, choices: Choices, every: bool) -> str:
+        """Return in what a frame is unlike those of the calibration; empty where it is like them."""
+        if (image.shape[1], image.shape[0]) != self.size:
+            return f"of {image.shape[1]} x {image.shape[0]} px, not {self.size[0]} x {self.size[1]}"
+        if (choices.detector, every) != (self.detector, self.every):
+            kind = "all" if every else "isolated"
+            return f"searched for {kind} highlights by {choices.detector}, which those were not"
+        if self.shift is None:
+            return ""
+        statistics = statistics_of(image)
+        distance = math.inf if statistics is None else self.shift.distance(statistics)
+        return f"{distance:.3g} standard deviations off" if distance > self.shift.limit else ""
+
+
+@lru_cache(maxsize=8)
+def _read(path: Path, _: float) -> CoreCalibration:
+    return validate(CoreCalibration, read_json(path, "a calibration of simtest calibrate core"), str(path))
+
+
+def read_calibrations(files: Sequence[str]) -> dict[str, CoreCalibration]:
+    """Read the calibrations of cores, by the cores' names in results."""
+    paths = [Path(file) for file in files]
+    made = {own.core: own for own in (_read(each, each.stat().st_mtime if each.is_file() else 0.0) for each in paths)}
+    if len(made) < len(paths):
+        raise InputError(f"{', '.join(files)}: several files of one core; one must be given")
+    return made
+
+
+# What a frame's answers get -------------------------------------------------------------------------------------------
+
+
+def with_regions(
+    spots: "Sequence[Specularity]", image: Image, choices: Choices, every: bool, given: CoreRegions
+) -> "list[Specularity]":
+    """Return the specularities of a frame with the regions of the calibrated cores' answers, or with their refusals."""
+    files = read_calibrations(given.files)
+    if not files.keys() & {*choices.estimators}:
+        run = ", ".join(choices.estimators)
+        raise InputError(f"{', '.join(given.files)}: of {', '.join(files)}; must be of an estimator that runs: {run}")
+    outside = {name: own.outside(image, choices, every) for name, own in files.items()}
+    size, most = (image.shape[1], image.shape[0]), given.refuse_above_deg or MOST_DEG
+
+    def judged(spot: "Specularity", name: str, estimate: Estimate | Failure) -> Estimate | Failure:
+        if isinstance(estimate, Failure) or name not in files or estimate.target not in files[name].strata:
+            return estimate
+        own, unlike = files[name], outside[name]
+        if unlike and given.shifted == "refuse":
+            return Failure(Reason.REFUSED, f"the frame is unlike those of the calibration: it is {unlike}")
+        first, last = own.strata[estimate.target].region(features(spot, estimate, size), bool(unlike))
+        if last > most:
+            return Failure(Reason.REFUSED, f"its calibrated 95 % radius is {last:.3g} deg, above {most:g}")
+        source = f"calibrated on {own.highlights} highlights of {own.scope}"
+        worst = f"; the worst of them, as the frame is {unlike}" if unlike else ""
+        return replace(estimate, calibrated=CalibratedRegion(first, last, source + worst))
+
+    made = []
+    for spot in spots:
+        results = {name: judged(spot, name, each) for name, each in spot.estimates.items()}
+        organ = {name: judged(spot, name, each) for name, each in spot.organ.items()}
+        # An organ's normal is no failure: a refused one stays without a region.
+        kept = {name: each for name, each in organ.items() if isinstance(each, Estimate)}
+        made.append(replace(spot, estimates=results, organ={**spot.organ, **kept}))
+    return made
+
+
+def statistics_of(image: Image) -> Array | None:
+    """Return a frame's realism statistics, NaN where it does not tell one; None of a grey or a very small frame."""
+    if min(image.shape[:2]) < LEAST_SIDE or not is_coloured(image):
+        return None
+    return summarise(measure(np.asarray(image, np.float32)))

@@ -1,0 +1,365 @@
+"""Regions of a core's answers by its calibration: how it is found, what its file holds, and what answers get by it."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import simtest
+from simtest.advice import core_calibration
+from simtest.advice.core_calibration import (
+    ORDER,
+    batch_experiment,
+    calibrate_core,
+    kept_frame,
+    quantile,
+    shift_of,
+    strata_of,
+)
+from simtest.advice.plan import Question
+from simtest.advice.scope import read_scope
+from simtest.cli.commands import APP
+from simtest.cli.common import RegionOptions
+from simtest.dataset.scoring.frames import CaseFrames
+from simtest.errors import Failure, InputError, Reason
+from simtest.estimators import Estimate
+from simtest.reconstruction.outputs import REGION_COLUMNS, columns_of
+from simtest.reconstruction.regions import CoreCalibration, read_calibrations
+from simtest.reconstruction.statistics import NAMES
+from simtest.spec import Experiment
+from simtest.spec.recipes import CoreRegions
+from simtest.validation.cases import expand
+
+# What is found --------------------------------------------------------------------------------------------------------
+
+
+def clusters(rng, frames, each, alike):
+    """Return errors in frames that share a part of them, and the frames' numbers."""
+    of = np.repeat(np.arange(frames), rng.poisson(each, frames) + 1)
+    shared = np.sqrt(alike) * rng.standard_normal(frames)[of]
+    return np.exp(shared + np.sqrt(1 - alike) * rng.standard_normal(len(of))), of
+
+
+def coverage(find, frames, each, alike, level, draws=400):
+    """Return the share of new frames' answers within what is found."""
+    rng, held = np.random.default_rng(7), []
+    for _ in range(draws):
+        limit = find(*clusters(rng, frames, each, alike), level)
+        held.append(np.concatenate([clusters(rng, 1, each, alike)[0] <= limit for _ in range(10)]))
+    return np.mean(np.concatenate(held)), np.std([each.mean() for each in held]) / np.sqrt(draws)
+
+
+@settings(max_examples=6, deadline=None)
+@given(
+    st.integers(20, 60), st.sampled_from([0, 4, 12]), st.sampled_from([0.0, 0.5, 0.9]), st.sampled_from([0.68, 0.95])
+)
+def test_a_share_of_a_new_frames_answers_is_within_the_quantile(frames, each, alike, level):
+    held, deviation = coverage(quantile, frames, each, alike, level)
+    assert level - 4 * deviation < held < level + 0.05 + 1 / frames
+
+
+def test_highlights_are_not_independent_so_a_plain_quantile_holds_less():
+    held, deviation = coverage(lambda values, _, level: np.quantile(values, level), 20, 12, 0.9, 0.95)
+    assert held < 0.95 - 4 * deviation
+
+
+def test_too_few_frames_tell_no_quantile():
+    values = np.arange(18.0)
+    assert quantile(values, np.arange(18), 0.95) == np.inf
+    assert quantile(np.arange(19.0), np.arange(19), 0.95) == 18.0
+
+
+def drawn(seed, frames=120, each=10):
+    """Return features and errors of answers whose reported deviation tells the error, and radius nothing."""
+    rng = np.random.default_rng(seed)
+    of = np.repeat(np.arange(frames), each)
+    seen = {name: rng.uniform(0.1, 1.0, len(of)) for name in ORDER}
+    seen["sigma_deg"] = rng.choice([0.2, 1.0, 8.0], len(of))
+    seen["flags"], seen["kind"] = rng.integers(0, 3, len(of)).astype(float), np.full(len(of), -1.0)
+    return seen, seen["sigma_deg"] * rng.rayleigh(1.0, len(of)), of
+
+
+def test_strata_part_all_answers_once_and_hold_in_each():
+    seen, errors, of = drawn(1)
+    strata = strata_of(seen, errors, of)
+    assert strata.scale == "reported"
+    assert len(strata.parts) > 2
+    assert sum(part.highlights for part in strata.parts) == len(errors)
+    fresh, new, _ = drawn(2)
+    rows = [{name: float(values[i]) for name, values in fresh.items()} for i in range(len(new))]
+    assert all(sum(part.holds(row) for part in strata.parts) == 1 for row in rows)
+    for level, share in enumerate((0.68, 0.95)):
+        radii = np.array([strata.region(row, False)[level] for row in rows])
+        assert np.mean(new <= radii) == pytest.approx(share, abs=0.03)
+        for part in strata.parts:
+            own = np.array([part.holds(row) for row in rows])
+            assert np.mean(new[own] <= radii[own]) > share - 0.1
+
+
+def test_the_expected_error_is_the_scale_where_no_deviation_is_reported():
+    seen, errors, of = drawn(3)
+    told = {**seen, "sigma_deg": np.full(len(of), -1.0), "radius_px": seen["sigma_deg"]}
+    assert strata_of(told, errors, of).scale == "expected"
+    # A shuffled error depends on nothing.
+    shuffled = np.random.default_rng(0).permutation(errors)
+    row = {name: float(values[0]) for name, values in told.items()}
+    flat = strata_of(told, shuffled, of)
+    assert flat.region({**row, "radius_px": 0.2}, False)[1] == pytest.approx(flat.parts[0].error_deg[1], rel=0.5)
+
+
+def test_outside_an_answer_has_the_worst_region():
+    seen, errors, of = drawn(1)
+    strata = strata_of(seen, errors, of)
+    row = {name: float(values[0]) for name, values in seen.items()}
+    sure = {**row, "sigma_deg": 0.2}
+    assert strata.region(sure, True)[1] >= max(part.error_deg[1] for part in strata.parts)
+    assert strata.region(sure, False)[1] < 1.0
+    # What reports no deviation, where all did in the calibration, is as uncertain.
+    assert strata.region({**row, "sigma_deg": -1.0}, False) == strata.region({**row, "sigma_deg": -1.0}, True)
+    assert strata.region({**row, "sigma_deg": 500.0}, False) == (180.0, 180.0)
+
+
+def test_the_check_on_shift_finds_shifted_frames_and_few_others():
+    rng = np.random.default_rng(4)
+    mixing = rng.standard_normal((len(NAMES), len(NAMES)))
+    frames = rng.standard_normal((300, len(NAMES))) @ mixing
+    frames[::7, 3] = np.nan
+    found = shift_of(frames)
+    fresh = rng.standard_normal((600, len(NAMES))) @ mixing
+    assert np.mean([found.distance(each) > found.limit for each in fresh]) < 0.09
+    assert np.mean([found.distance(each + 6 * mixing[0]) > found.limit for each in fresh]) > 0.8
+
+
+# Its file and what answers get ----------------------------------------------------------------------------------------
+
+
+def calibration(tmp_path, name="calibration.json", **changes):
+    """Write a calibration of cone_axis in grey frames of 160 x 120 px, and return its file."""
+    seen, errors, of = drawn(1)
+    strata = strata_of({**seen, "sigma_deg": np.full(len(of), -1.0)}, errors, of)
+    made = CoreCalibration(
+        core="cone_axis", scope="colocated", size=(160, 120), detector="peaks", every=False, highlights=1200,
+        frames=120, strata={"fine": strata, "base": strata}, shift=None, made={},
+    )  # fmt: skip
+    path = tmp_path / name
+    path.write_text(json.dumps(made.model_dump(mode="json") | changes))
+    return path
+
+
+def lobes():
+    y, x = np.mgrid[:120, :160] + 0.5
+    return sum(np.exp(-((x - at) ** 2 + (y - 60) ** 2) / 100) for at in (45, 115)).astype(np.float32)
+
+
+CAMERA = simtest.Camera.from_fov(60.0, 160, 120)
+
+
+def test_answers_have_their_regions_and_no_others_have(tmp_path):
+    path = calibration(tmp_path)
+    found = simtest.reconstruct(lobes(), CAMERA, ["cone_axis", "curved"], regions=path)
+    plain = simtest.reconstruct(lobes(), CAMERA, ["cone_axis", "curved"])
+    assert len(found) == 2
+    for spot, same in zip(found, plain, strict=True):
+        region = spot.estimates["cone_axis"].calibrated
+        assert 0 < region.radius_68_deg < region.radius_95_deg
+        assert region.region_source == "calibrated on 1200 highlights of colocated"
+        assert spot.organ["cone_axis"].calibrated is not None
+        assert spot.estimates["curved"].calibrated is None
+        assert np.array_equal(spot.estimates["cone_axis"].covariance, same.estimates["cone_axis"].covariance)
+        assert "radius_95_deg" in spot.to_json()["estimates"]["cone_axis"]
+    table = found.to_polars()
+    assert table.filter(pl.col("estimator") == "cone_axis")["radius_95_deg"].null_count() == 0
+    assert table.filter(pl.col("estimator") == "curved")["radius_95_deg"].null_count() == 2
+    # Without a calibration nothing is written of it.
+    assert not {*REGION_COLUMNS} & {*columns_of([spot.to_json() for spot in plain])}
+    assert all("calibrated" not in json.dumps(spot.to_json(), default=str) for spot in plain)
+
+
+def test_too_wide_regions_are_refused(tmp_path):
+    files = (str(calibration(tmp_path)),)
+    found = simtest.reconstruct(lobes(), CAMERA, ["cone_axis"], regions=CoreRegions(files=files, refuse_above_deg=0.01))
+    assert [str(spot.estimates["cone_axis"].reason) for spot in found] == ["refused"] * 2
+    assert "95 % radius" in found[0].estimates["cone_axis"].detail
+    assert found[0].best is None
+    kept = simtest.reconstruct(lobes(), CAMERA, ["cone_axis"], regions=CoreRegions(files=files, refuse_above_deg=180))
+    assert isinstance(kept[0].estimates["cone_axis"], Estimate)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"size": [320, 240]}, "160 x 120 px, not 320 x 240"),
+        ({"detector": "colour"}, "isolated highlights by peaks"),
+        ({"every": True}, "isolated highlights by peaks"),
+        ({"shift": {"centre": [0.0] * 19, "whitening": np.eye(19).tolist(), "limit": 1.0}}, "inf standard deviations"),
+    ],
+)
+def test_other_frames_than_the_calibrations_are_told(tmp_path, change, why):
+    files = (str(calibration(tmp_path, **change)),)
+    near = simtest.reconstruct(lobes(), CAMERA, ["cone_axis"], regions=calibration(tmp_path, "near.json"))
+    widened = simtest.reconstruct(lobes(), CAMERA, ["cone_axis"], regions=CoreRegions(files=files))
+    region = widened[0].estimates["cone_axis"].calibrated
+    assert why in region.region_source
+    assert region.radius_95_deg > near[0].estimates["cone_axis"].calibrated.radius_95_deg
+    refused = simtest.reconstruct(lobes(), CAMERA, ["cone_axis"], regions=CoreRegions(files=files, shifted="refuse"))
+    failure = refused[0].estimates["cone_axis"]
+    assert isinstance(failure, Failure)
+    assert failure.reason is Reason.REFUSED
+    assert why in failure.detail
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"format": "simtest core calibration, version 2"}, "format"),
+        ({"highlights": "many"}, "highlights = 'many'"),
+        ({"strata": {}}, "strata"),
+        ({"strata": {"middle": {}}}, "strata"),
+        ({"shift": {"centre": [0.0], "whitening": [[1.0]], "limit": 1.0}}, "shift.centre"),
+        ({"bias": 1}, "bias"),
+    ],
+)
+def test_a_malformed_file_is_refused_in_a_line(tmp_path, change, told):
+    path = calibration(tmp_path, **change)
+    with pytest.raises(InputError) as error:
+        read_calibrations([str(path)])
+    assert str(path) in str(error.value)
+    assert told in str(error.value)
+
+
+def test_files_must_be_there_and_of_an_estimator_that_runs(tmp_path):
+    with pytest.raises(InputError, match=r"gone\.json"):
+        read_calibrations([str(tmp_path / "gone.json")])
+    (tmp_path / "text.json").write_text("no JSON")
+    with pytest.raises(InputError, match="not JSON"):
+        read_calibrations([str(tmp_path / "text.json")])
+    path = calibration(tmp_path)
+    with pytest.raises(InputError, match="several files of one core"):
+        read_calibrations([str(path), str(calibration(tmp_path, "again.json"))])
+    with pytest.raises(InputError, match="of cone_axis; must be of an estimator that runs: curved"):
+        simtest.reconstruct(lobes(), CAMERA, ["curved"], regions=path)
+
+
+# Rendered frames ------------------------------------------------------------------------------------------------------
+
+SMALL = {"camera.width": 160, "camera.height": 120, "camera.fx": 140.0, "camera.fy": 140.0}
+
+
+class Stray:
+    """Answers beside every highlight, and beside the surface."""
+
+    def estimate_frame(self, frame, camera, priors):
+        """Return the sightline to the camera at two pixels."""
+        normal = np.array([0.0, 0.0, -1.0])
+        return [Estimate(normal, normal[None], np.array(look), covariance=1e-4 * np.eye(2))
+                for look in ([45.5, 60.5], [1.0, 1.0])]  # fmt: skip
+
+
+def test_false_answers_are_judged_where_they_look():
+    # The corner sees past a sphere of radius 4, whose nearest point is 10 mm away.
+    held = {**SMALL, "surface.radius_mm": 4.0, "surface.tilt_deg": 0.0}
+    experiment = Experiment.model_validate(
+        {"name": "stray", "realisations": 1, "groups": [{"scene": "sphere", "set": held}]}
+    )
+    (frame,) = CaseFrames(experiment, expand(experiment)[0], 0, None)
+    answers = kept_frame(frame, {"stray": Stray()}, "peaks", True)["answers"]
+    # In closed form: where the sightline meets the sphere, the normal's angle to the axis.
+    axis = np.array([(45.5 - 80) / 140, (60.5 - 60) / 140, 1.0])
+    ray, centre = axis / np.linalg.norm(axis), np.array([0.0, 0.0, 14.0])
+    along = ray @ centre
+    normal = (ray * (along - np.sqrt(along**2 - centre @ centre + 4.0**2)) - centre) / 4.0
+    expected = np.degrees(np.arccos(-normal[2]))
+    assert expected > 20
+    told = sorted(each["error_deg"] for each in answers if each["target"] == "fine")
+    assert told == pytest.approx([expected, 180.0], abs=0.01)
+
+
+def test_a_run_has_the_regions_and_is_another_run(tmp_path):
+    described = {"name": "regions", "realisations": 2, "seed": 3, "estimators": ["cone_axis", "curved"],
+                 "groups": [{"scene": "cylinder", "set": SMALL}]}  # fmt: skip
+    plain = Experiment.model_validate(described)
+    regions = CoreRegions(files=(str(calibration(tmp_path)),))
+    told = plain.model_copy(update={"regions": regions})
+    assert "regions" not in plain.model_dump(mode="json")
+    rows = simtest.validate(told, tmp_path / "told").results
+    same = simtest.validate(plain, tmp_path / "plain").results
+    own = rows.filter(pl.col("estimator") == "cone_axis", pl.col("status") == "ok")
+    assert own.height == 2
+    assert own["radius_95_deg"].null_count() == 0
+    assert rows.drop(REGION_COLUMNS).equals(same)
+    prints = [json.loads((tmp_path / each / "summary.json").read_text())["run"]["fingerprint"]
+              for each in ("told", "plain")]  # fmt: skip
+    assert prints[0] != prints[1]
+    refused = plain.model_copy(update={"regions": regions.model_copy(update={"refuse_above_deg": 0.01})})
+    assert {*simtest.validate(refused, tmp_path / "refused").results["status"]} == {"refused", "ok"}
+
+
+def test_batches_differ_and_show_the_organs_colours():
+    question = Question(read_scope("colocated"), seed=4)
+    first, second, again = (batch_experiment(question, number) for number in (0, 1, 0))
+    assert first == again
+    assert first.groups[0].pool != second.groups[0].pool
+    # An advice's walls have no vessels.
+    assert "reflectance.albedo" not in first.groups[0].set
+
+
+@pytest.mark.slow
+def test_a_stopped_calibration_goes_on_to_the_same_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(core_calibration, "LEAST_BATCHES", 5)
+    monkeypatch.setattr(core_calibration, "LEAST_FRAMES", 19)
+    text = "[camera]\nwidth = 64\nheight = 64\nfx = 40.0\nfy = 40.0\n[sensor]\npreset = 'colonoscope_hd'\n"
+    (tmp_path / "scope.toml").write_text(text)
+    question = Question(read_scope(str(tmp_path / "scope.toml")), "plane", seed=5)
+    whole = calibrate_core("cone_axis", question, tmp_path / "whole.json", 10, "peaks", True)
+    steps = []
+
+    def stop(done, total, what):
+        steps.append(done)
+        if done == 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        calibrate_core("cone_axis", question, tmp_path / "part.json", 10, "peaks", True, progress=stop)
+    assert not (tmp_path / "part.json").exists()
+    steps.clear()
+    again = calibrate_core(
+        "cone_axis", question, tmp_path / "part.json", 10, "peaks", True, progress=lambda *told: steps.append(told[0])
+    )
+    assert again == whole
+    # The first batch was not rendered again.
+    assert steps[0] == 9
+    assert (tmp_path / "whole.json").read_bytes() == (tmp_path / "part.json").read_bytes()
+    # Another seed's answers are kept apart.
+    other = calibrate_core("cone_axis", replace(question, seed=6), tmp_path / "part.json", 10, "peaks", True)
+    assert other.strata != whole.strata
+
+
+def test_the_command_line_takes_calibrations(tmp_path, monkeypatch):
+    calibration(tmp_path, detector="colour")
+    monkeypatch.chdir(tmp_path)
+    cv2.imwrite("picture.png", np.round(255 * lobes()).astype(np.uint8))
+    words = (
+        "reconstruct picture.png --fov 60 --out out --detector peaks --estimator cone_axis --regions calibration.json"
+    )
+    with pytest.warns(UserWarning, match="no calibration"):
+        APP(words.split(), exit_on_error=False, result_action="return_value")
+    told = json.loads((tmp_path / "out" / "normals.json").read_text())["specularities"]
+    assert len(told) == 2
+    assert all("peaks" in each["estimates"]["cone_axis"]["region_source"] for each in told)
+    assert "radius_95_deg" in (tmp_path / "out" / "normals.csv").read_text().splitlines()[0]
+
+
+def test_options_of_regions_need_a_file(tmp_path):
+    with pytest.raises(InputError, match="--refuse-above and --shifted need --regions"):
+        RegionOptions(refuse_above=20.0).read()
+    with pytest.raises(InputError, match=r"gone\.json"):
+        RegionOptions([tmp_path / "gone.json"]).read()
+    read = RegionOptions([calibration(tmp_path)], 20.0, "refuse").read()
+    assert read == CoreRegions(files=(str(tmp_path / "calibration.json"),), refuse_above_deg=20.0, shifted="refuse")
+    with pytest.raises(InputError, match="refuse_above_deg = 200"):
+        RegionOptions([calibration(tmp_path)], 200.0).read()
