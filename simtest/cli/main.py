@@ -114,7 +114,7 @@ def meant_flag(word: str, options: Iterable[str]) -> str | None:
 
 BAD_USE = 2
 
-GOING_ON = ("validate", "advise", "dataset", "nightly", "bench")
+GOING_ON = ("validate", "advise", "dataset", "nightly", "bench", "calibrate core")
 """Commands that take up what a stopped run has finished."""
 
 
@@ -130,7 +130,7 @@ def main() -> None:
             _mend_terminal()
             code = _run()
         except KeyboardInterrupt as stopped:
-            goes_on = sys.argv[1:2] and sys.argv[1] in GOING_ON
+            goes_on = " ".join(sys.argv[1:3]).startswith(GOING_ON)
             kept = (
                 f"what is finished is kept, and the same command {'goes on from there' if goes_on else 'begins anew'}"
             )
