@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from skimage.measure import label
+from skimage.morphology import local_maxima, reconstruction
 
 from simtest.calibration import srgb_encode
 from simtest.detection.classify import border_of
@@ -14,6 +16,7 @@ from simtest.detection.view import find_foreign, find_view
 from simtest.errors import Failure, Reason
 from simtest.geometry import Camera
 from simtest.reconstruction import detect_in_picture, reconstruct
+from simtest.simulation.highlights import SADDLE
 from simtest.simulation.highlights import find_spots as visible_spots
 
 WIDTH, HEIGHT = 240, 180
@@ -47,7 +50,7 @@ def nearest(highlights, x, y):
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10_000))
 def test_summits_are_the_maxima_whose_saddle_is_low_enough(seed):
-    """The same as by morphological reconstruction, which the truth's list of visible highlights uses."""
+    """The same as of the truth's list of visible highlights, which shares no code with them."""
     rng = np.random.default_rng(seed)
     light = cv2.GaussianBlur(rng.random((40, 50)).astype(np.float32), (0, 0), 2.0)
     light = (light - light.min()) / (light.max() - light.min()) + 0.05
@@ -60,6 +63,21 @@ def test_summits_are_the_maxima_whose_saddle_is_low_enough(seed):
     # a saddle is no higher than either of the summits that it parts
     low = light[basins.saddles[:, 0], basins.saddles[:, 1]]
     assert (low <= light[basins.rows, basins.columns][basins.pairs].min(axis=1)).all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.integers(3, 30))
+def test_visible_spots_are_the_summits_that_morphological_reconstruction_leaves(seed, levels):
+    rng = np.random.default_rng(seed)
+    light = cv2.GaussianBlur(rng.random((30, 40)).astype(np.float32), (0, 0), 1.5)
+    light = np.round(levels * (light - light.min()) / np.ptp(light)) + 1  # with plateaus
+    log = np.log(light.astype(float))
+    flooded = reconstruction(log + np.log(SADDLE), log, method="dilation")
+    summits, count = label(local_maxima(flooded), connectivity=2, return_num=True)
+    # of each the first of its brightest pixels
+    first = [int(np.argmax(np.where(summits == n, light, 0))) for n in range(1, count + 1)]
+    spots = visible_spots(light, light)
+    assert sorted(first) == sorted((spots.rows * light.shape[1] + spots.columns).tolist())
 
 
 def test_a_plateau_has_one_summit_and_an_empty_mask_none():
