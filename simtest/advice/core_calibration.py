@@ -22,7 +22,7 @@ from simtest.advice.plan import DISTANCES, Question, main_experiment
 from simtest.dataset.scoring.frames import CaseFrames, RenderedFrame
 from simtest.errors import InputError
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
-from simtest.estimators.names import absolute_names, close_cores, core_hashes, forgive_cores, short_names
+from simtest.estimators.names import ESTIMATORS, absolute_names, close_cores, core_hashes, forgive_cores, short_names
 from simtest.estimators.protocol import Target
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction import regions
@@ -232,6 +232,7 @@ def calibrate_core(
         "relief": None if scope.relief is None else scope.relief.model_dump(mode="json"),
         "distances_mm": [*question.distances_mm], "seed": question.seed, "detector": detector, "every": every,
         "version": provenance.version(), "source": provenance.source_hash(),
+        "packages": provenance.versions() | ESTIMATORS.distributions([core]),
     }  # fmt: skip
     digest = hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
     folder = out.with_suffix(".frames") / digest[:12]

@@ -213,6 +213,11 @@ class RegionOptions:
     refuse_above: Annotated[float | None, about("Refuse answers whose calibrated 95 % radius is larger, deg.")] = None
     shifted: Annotated[Literal["widen", "refuse"], about("In unlike frames: the worst region, or none.")] = "widen"
 
+    def refuse(self) -> None:
+        """Raise `InputError` if any is given, where maps are scored."""
+        if self != NO_REGIONS:
+            raise InputError("--regions, --refuse-above, --shifted: are for answers at highlights, not for maps")
+
     def read(self) -> "CoreRegions | None":
         """Return them; None where no calibration is given."""
         if self.regions is None:

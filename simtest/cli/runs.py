@@ -273,6 +273,7 @@ def score(
         folder of maps of normals or depths, or the word shading, for a score of every pixel (docs/howto/scoring.md).
     """
     if is_dense(answers):
+        calibrated.refuse()
         return score_dense(answers, on, out, how.named(name))
     how.refuse()
     from simtest.dataset.scoring.score import score_table
@@ -431,6 +432,8 @@ def run(
         raise InputError("--core and --maps: give one of them; --maps runs the part dense, --core all others")
     if core is None and parts not in (None, ["dense"]):
         raise InputError(f"--part {parts[0] if parts else ''}: maps are scored on the part dense alone")
+    if core is None:
+        calibrated.refuse()
     read, chosen = load_suite(suite), engine.make()
     stopped = "finished frames are kept; the same command scores all maps anew" if core is None else ""
     with exclusive_folder(out), progress_bar(stopped=stopped) as progress:

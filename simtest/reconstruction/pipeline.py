@@ -64,7 +64,7 @@ def reconstruct(
     encoding: str | None = None,
     keep_overlays: bool = False,
     least_score: float | None = None,
-    regions: "CoreRegions | str | Path | None" = None,
+    regions: "CoreRegions | str | Path | Sequence[str | Path] | None" = None,
 ) -> Specularities:
     """Reconstruct the normals at a frame's isolated specularities.
 
@@ -107,8 +107,8 @@ def reconstruct(
         Found by colour, take text and squares that are drawn on the picture for tissue; default: they are masked.
     least_score : float, optional
         Highlights with a smaller score, which may be none, have no best normal; 0 keeps all. Default `LEAST_SCORE`.
-    regions : path or CoreRegions, optional
-        A core's calibration (`simtest calibrate core`): its answers have regions of 68 and 95 % (`calibrated`).
+    regions : path, sequence of paths or CoreRegions, optional
+        Cores' calibrations (`simtest calibrate core`): their answers have regions of 68 and 95 % (`calibrated`).
 
     Returns
     -------
@@ -152,10 +152,15 @@ def reconstruct(
         check_size(image, camera.camera)
     else:
         image, is_picture = check_frame(frame, camera.camera, encoding)
-    if isinstance(regions, str | Path):
+    if regions is not None:
         from simtest.spec.recipes import CoreRegions
+        from simtest.spec.spec_model import validate
 
-        regions = CoreRegions(files=(str(regions),))
+        if not isinstance(regions, CoreRegions):
+            files = [regions] if isinstance(regions, str | Path) else regions
+            if not isinstance(files, Sequence) or not all(isinstance(file, str | Path) for file in files):
+                raise InputError(f"regions is a {type(regions).__name__}: must be a path, several, or CoreRegions")
+            regions = validate(CoreRegions, {"files": [str(file) for file in files]}, "regions")
     options = Options(
         estimators=estimators, roi=roi, encoding=encoding, every=not isolated, detector=detector,
         smoothing_px=smoothing_px, target=target, keep_overlays=bool(keep_overlays), least_score=least_score,
@@ -206,7 +211,7 @@ def run(image: Image, calibration: Calibration, options: Options, is_picture: bo
     if options.regions is not None:
         from simtest.reconstruction.regions import with_regions
 
-        numbered = with_regions(numbered, image, choices, options.every, options.regions)
+        numbered = with_regions(numbered, image, choices, options)
     return Specularities(numbered, detection, choices, no_cloud=no_cloud)
 
 

@@ -22,7 +22,7 @@ from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.protocol import CalibratedRegion, Target
 from simtest.reconstruction.images import is_coloured
-from simtest.reconstruction.options import Choices
+from simtest.reconstruction.options import Choices, Options
 from simtest.reconstruction.statistics import LEAST_SIDE, NAMES, measure, summarise
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.files import read_json
@@ -172,12 +172,14 @@ class CoreCalibration(Spec):
     shift: Shift | None = Field(description="None where the frames are grey")
     made: dict[str, JsonValue] = Field(description="of what, and with which versions")
 
-    def outside(self, image: Image, choices: Choices, every: bool) -> str:
-        """Return in what a frame is unlike those of the calibration; empty where it is like them."""
+    def outside(self, image: Image, choices: Choices, options: Options) -> str:
+        """Return in what a frame, or the search in it, is unlike those of the calibration; empty where it is like."""
         if (image.shape[1], image.shape[0]) != self.size:
             return f"of {image.shape[1]} x {image.shape[0]} px, not {self.size[0]} x {self.size[1]}"
-        if (choices.detector, every) != (self.detector, self.every):
-            kind = "all" if every else "isolated"
+        if options.roi is not None or options.keep_overlays or options.smoothing_px is not None:
+            return "searched in a region, with overlays kept or with another smoothing, as those were not"
+        if (choices.detector, options.every) != (self.detector, self.every):
+            kind = "all" if options.every else "isolated"
             return f"searched for {kind} highlights by {choices.detector}, which those were not"
         if self.shift is None:
             return ""
@@ -203,15 +205,23 @@ def read_calibrations(files: Sequence[str]) -> dict[str, CoreCalibration]:
 # What a frame's answers get -------------------------------------------------------------------------------------------
 
 
+def calibrations_of(given: CoreRegions, estimators: Sequence[str]) -> dict[str, CoreCalibration]:
+    """Read the calibrations; raise `InputError` where none is of one of the estimators, by their names in results."""
+    files = read_calibrations(given.files)
+    if not files.keys() & {*estimators}:
+        run = ", ".join(estimators)
+        raise InputError(f"{', '.join(given.files)}: of {', '.join(files)}; must be of an estimator that runs: {run}")
+    return files
+
+
 def with_regions(
-    spots: "Sequence[Specularity]", image: Image, choices: Choices, every: bool, given: CoreRegions
+    spots: "Sequence[Specularity]", image: Image, choices: Choices, options: Options
 ) -> "list[Specularity]":
     """Return the specularities of a frame with the regions of the calibrated cores' answers, or with their refusals."""
-    files = read_calibrations(given.files)
-    if not files.keys() & {*choices.estimators}:
-        run = ", ".join(choices.estimators)
-        raise InputError(f"{', '.join(given.files)}: of {', '.join(files)}; must be of an estimator that runs: {run}")
-    outside = {name: own.outside(image, choices, every) for name, own in files.items()}
+    given = options.regions
+    assert given is not None
+    files = calibrations_of(given, choices.estimators)
+    outside = {name: own.outside(image, choices, options) for name, own in files.items()}
     size, most = (image.shape[1], image.shape[0]), given.refuse_above_deg or MOST_DEG
 
     def judged(spot: "Specularity", name: str, estimate: Estimate | Failure) -> Estimate | Failure:

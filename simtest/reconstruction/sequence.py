@@ -46,7 +46,7 @@ from simtest.runtime.arrays import Image
 from simtest.runtime.boundary import plain_errors
 from simtest.runtime.files import JsonObject, make_folder, read_json, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.provenance import environment, version
+from simtest.runtime.provenance import environment, file_hash, version
 
 Progress = Callable[[int, int, str], None]
 
@@ -363,6 +363,9 @@ def _settings(source: Path, options: Options, calibration: Calibration | None) -
     """Return the run's settings, through JSON, so that paths and tuples compare with the text and lists of a file."""
     later = ("poses", "regions")
     given = {key: value for key, value in asdict(options).items() if key not in later or value is not None}
+    if (regions := options.regions) is not None:
+        hashes = [file_hash(Path(file)) for file in regions.files]
+        given["regions"] = {**regions.model_dump(mode="json"), "files": hashes}
     if calibration is not None:
         content = json.dumps(asdict(calibration), default=str)
         given["calibration"] = hashlib.sha256(content.encode()).hexdigest()

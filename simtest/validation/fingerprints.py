@@ -14,12 +14,11 @@ from simtest.validation.cases import Case
 
 def fingerprint(experiment: Experiment, cases: list[Case], variant: str) -> str:
     """Return a hash of everything that determines a run's results."""
-    calibrations = () if experiment.regions is None else experiment.regions.files
     return _hash(
         {
             "experiment": experiment.model_dump(mode="json"),
             "scenes": [case.data for case in cases],
-            "inputs": input_hashes(cases) | {each: provenance.file_hash(Path(each)) for each in calibrations},
+            "inputs": input_hashes(cases) | region_hashes(experiment),
             "versions": provenance.versions() | ESTIMATORS.distributions(experiment.estimators),
             "cores": core_hashes(experiment.estimators),
             "source": provenance.source_hash(),
@@ -35,6 +34,12 @@ def definition(experiment: Experiment, cases: list[Case]) -> str:
     scenes = [case.data for case in cases]
     itself = experiment.model_dump(mode="json", exclude={"title", "description"})
     return _hash({"experiment": itself, "scenes": scenes, "inputs": files})
+
+
+def region_hashes(experiment: Experiment) -> dict[str, str]:
+    """Return the hashes of the calibrations by which answers get regions."""
+    files = () if experiment.regions is None else experiment.regions.files
+    return {file: provenance.file_hash(Path(file)) for file in files}
 
 
 def _hash(content: Json) -> str:

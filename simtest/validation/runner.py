@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from simtest.estimators.names import close_cores, core_records
+from simtest.estimators.names import close_cores, core_records, short_names
 from simtest.estimators.process import is_core
 from simtest.rendering import backend
 from simtest.runtime import provenance
@@ -17,7 +17,7 @@ from simtest.runtime.files import Json
 from simtest.runtime.processes import Engine, make_engine
 from simtest.spec import Experiment
 from simtest.validation.cases import Case, expand
-from simtest.validation.fingerprints import fingerprint, input_hashes
+from simtest.validation.fingerprints import fingerprint, input_hashes, region_hashes
 from simtest.validation.run_folder import (
     PARTS,
     RESULTS,
@@ -216,7 +216,7 @@ def run_experiments(
                 started=started.isoformat(timespec="seconds"),
                 duration_s=round(time.monotonic() - clock, 1),
                 command=command,
-                inputs=input_hashes(job.cases),
+                inputs=input_hashes(job.cases) | region_hashes(job.experiment),
                 cores=cores[job.folder],
             )
             finished[job.folder] = _finish(job, record, resumed[job.folder])
@@ -264,6 +264,11 @@ def _checked_cores(jobs: Sequence[Job]) -> dict[Path, Cores]:
     """Return what the records of the runs, by folder, say of cores; a finished run names no unknown estimator."""
     for job in jobs:
         check_estimators(job.experiment.estimators)
+        if (regions := job.experiment.regions) is not None:
+            # Imported here: few runs have calibrations.
+            from simtest.reconstruction.regions import calibrations_of
+
+            calibrations_of(regions, short_names(job.experiment.estimators))
     return {job.folder: core_records(job.experiment.estimators) for job in jobs}
 
 

@@ -25,11 +25,13 @@ from simtest.advice.plan import Question
 from simtest.advice.scope import read_scope
 from simtest.cli.commands import APP
 from simtest.cli.common import RegionOptions
-from simtest.dataset.scoring.frames import CaseFrames
+from simtest.dataset.scoring.frames import CaseFrames, Source, frames_of_cases
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
+from simtest.reconstruction.options import Options
 from simtest.reconstruction.outputs import REGION_COLUMNS, columns_of
 from simtest.reconstruction.regions import CoreCalibration, read_calibrations
+from simtest.reconstruction.sequence import _settings
 from simtest.reconstruction.statistics import NAMES
 from simtest.spec import Experiment
 from simtest.spec.recipes import CoreRegions
@@ -245,6 +247,27 @@ def test_files_must_be_there_and_of_an_estimator_that_runs(tmp_path):
         simtest.reconstruct(lobes(), CAMERA, ["curved"], regions=path)
 
 
+def test_another_search_than_the_calibrations_is_told(tmp_path):
+    path = calibration(tmp_path)
+    for how in ({"roi": (20, 30, 50, 60)}, {"smoothing_px": 3.0}):
+        found = simtest.reconstruct(lobes(), CAMERA, ["cone_axis"], regions=[path], **how)
+        assert "searched in a region" in found[0].estimates["cone_axis"].calibrated.region_source
+
+
+@pytest.mark.parametrize("wrong", [5, [5], []])
+def test_what_names_no_file_is_refused(wrong):
+    with pytest.raises(InputError, match="regions"):
+        simtest.reconstruct(lobes(), CAMERA, ["cone_axis"], regions=wrong)
+
+
+def test_a_sequence_goes_on_with_the_same_calibration_alone(tmp_path):
+    options = Options(fov_deg=60.0, regions=CoreRegions(files=(str(calibration(tmp_path)),)))
+    before = _settings(tmp_path, options, None)
+    assert _settings(tmp_path, options, None) == before
+    calibration(tmp_path, highlights=1300)
+    assert _settings(tmp_path, options, None) != before
+
+
 # Rendered frames ------------------------------------------------------------------------------------------------------
 
 SMALL = {"camera.width": 160, "camera.height": 120, "camera.fx": 140.0, "camera.fy": 140.0}
@@ -297,6 +320,31 @@ def test_a_run_has_the_regions_and_is_another_run(tmp_path):
     assert prints[0] != prints[1]
     refused = plain.model_copy(update={"regions": regions.model_copy(update={"refuse_above_deg": 0.01})})
     assert {*simtest.validate(refused, tmp_path / "refused").results["status"]} == {"refused", "ok"}
+
+
+def test_a_run_is_scored_by_the_given_calibrations_not_by_its_own(tmp_path):
+    regions = CoreRegions(files=(str(calibration(tmp_path)),))
+    experiment = Experiment.model_validate(
+        {
+            "name": "regions",
+            "realisations": 1,
+            "estimators": ["curved"],
+            "groups": [{"scene": "cylinder", "set": SMALL}],
+        }
+    ).model_copy(update={"regions": regions})
+    cases = expand(experiment)
+    source = Source(
+        tmp_path, frames_of_cases(experiment, cases, "llvm_ad_mono"), "run", "", "", "", "", experiment, cases
+    )
+    bare = source.with_regions(None)
+    assert bare.recipe.regions is None
+    assert all(part.experiment.regions is None for part in bare.parts)
+    assert "region_source" not in bare.swept_example
+    assert bare.with_regions(regions).parts[0].experiment.regions == regions
+    # A calibration of none of the estimators is refused before the folder is touched.
+    with pytest.raises(InputError, match="must be of an estimator that runs: curved"):
+        simtest.validate(experiment, tmp_path / "run")
+    assert not [*(tmp_path / "run").glob("*")]
 
 
 def test_batches_differ_and_show_the_organs_colours():
@@ -361,5 +409,7 @@ def test_options_of_regions_need_a_file(tmp_path):
         RegionOptions([tmp_path / "gone.json"]).read()
     read = RegionOptions([calibration(tmp_path)], 20.0, "refuse").read()
     assert read == CoreRegions(files=(str(tmp_path / "calibration.json"),), refuse_above_deg=20.0, shifted="refuse")
+    with pytest.raises(InputError, match="not for maps"):
+        RegionOptions([tmp_path / "gone.json"]).refuse()
     with pytest.raises(InputError, match="refuse_above_deg = 200"):
         RegionOptions([calibration(tmp_path)], 200.0).read()

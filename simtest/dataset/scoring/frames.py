@@ -333,9 +333,11 @@ class Source:
             return swept_example(list(self.cases), self.recipe.regions)
         return {ON_INSTRUMENT: False, ANATOMY: ""}
 
-    def with_regions(self, regions: CoreRegions) -> "Source":
-        """Return it with the calibration by which answers get regions; raise `InputError` for a dataset."""
+    def with_regions(self, regions: CoreRegions | None) -> "Source":
+        """Return it with the calibrations by which answers get regions, its own left out; a dataset takes none."""
         if not isinstance(self.recipe, Experiment):
+            if regions is None:
+                return self
             raise InputError(f"{self.folder}: is a dataset; --regions is for answers to the frames of a run")
         recipe = self.recipe.model_copy(update={"regions": regions})
         return replace(self, recipe=recipe, parts=frames_of_cases(recipe, self.cases, self.variant))

@@ -86,9 +86,8 @@ def score_table(
     check_name(method, "--name")
     record = read_record(on)
     answers = read_answers(table, record, method)
-    source = open_source(on, record)
-    if regions is not None:
-        source = source.with_regions(regions)
+    source = open_source(on, record).with_regions(regions)
+    calibrations = [] if regions is None else [Path(file) for file in regions.files]
     if are_nested(on, out):
         raise InputError(f"--out {out}: must be neither the run that is scored on nor inside or around it")
     if (out / EXPORT).exists():
@@ -100,7 +99,8 @@ def score_table(
         results = _results(source, record, answers, out, engine or make_engine(), progress)
         for doubt in filter(None, [stray_rows(answers, record), *reversed_axes(results), *wide_regions(results)]):
             warnings.warn(f"{table}: {doubt}", stacklevel=2)
-        made = _run_record(source, record.fingerprint, (table, on / EXPORT), command, started, clock)
+        kind = record.fingerprint if regions is None else record.fingerprint + regions.model_dump_json()
+        made = _run_record(source, kind, (table, on / EXPORT, *calibrations), command, started, clock)
         described = {each: f"Answers of {table.name}, made elsewhere." for each in answers}
         write_results(out, made, results, source.recipe.name, source.summary(results, described))
     return Run(out, 0, results)
@@ -109,7 +109,7 @@ def score_table(
 def _run_record(
     source: Source, fingerprint: str, files: Sequence[Path], command: str, started: datetime, clock: float
 ) -> RunRecord:
-    """Return how a scored run was made: of the run of this fingerprint, and of a table and a record of an export."""
+    """Return how a scored run was made: of the run of this fingerprint, and of a table, an export and calibrations."""
     inputs = {str(path): provenance.file_hash(path) for path in files}
     return RunRecord(
         variant=source.variant,
