@@ -327,7 +327,7 @@ ROWS = (
         "HIGHLIGHT_CONTRAST_SIGMA * np.asarray(noise)", "0.5 * HIGHLIGHT_CONTRAST_SIGMA * np.asarray(noise)",
         "peaks detectors"),
     row("contrast of a peak without its surroundings", "thresholds", "detection.peaks:contrast",
-        "return peak - float(median(around) if around.size else least)", "return peak", "peaks detectors"),
+        "return peak - float(median(around))", "return peak", "peaks detectors"),
     row("region's box placed by the window, not the frame", "labels", "detection.peaks:_expanded_box",
         "component.y + int(rows[0])", "int(rows[0])", "peaks detectors"),
     row("open highlights count as closed", "thresholds", "detection.peaks:component_above",
