@@ -133,6 +133,8 @@ def _record_parts(spots: "Specularities", image: Path) -> "Iterator[str | Table]
         if (organ := spots.stated_of_organ) not in (None, spots.stated):
             yield f"of the organ below its relief: {organ}"
         yield MEANING
+    if spots.calibrated:
+        yield f"calibrated: {spots.calibrated}"
     yield from silent_lines(spots)
     if spots.of_organ and not spots.clouds:
         yield f"note: {spots.of_organ}"

@@ -5,6 +5,7 @@ A page is one file that needs nothing else, but for a sequence's pictures.
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -163,6 +164,7 @@ def _row(name: str, result: Estimate | Failure, spot: Specularity, lines: list[P
         "flags": result.flags,
         "error": error and error.error_deg,
         "cloud": _cloud(result),
+        **({} if result.calibrated is None else {"calibrated": asdict(result.calibrated)}),
     }
 
 

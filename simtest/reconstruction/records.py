@@ -347,6 +347,17 @@ class Specularities(list[Specularity]):
         """The same of the normals of the organ below its relief."""
         return stated_errors([each.organ[best] for each in self if (best := each.best) is not None and each.organ])
 
+    @property
+    def calibrated(self) -> str:
+        """How far the regions of calibrated cores' answers reach, and what says so; empty without a calibration."""
+        regions = [each.calibrated for spot in self for each in spot.estimates.values()
+                   if isinstance(each, Estimate) and each.calibrated is not None]  # fmt: skip
+        if not regions:
+            return ""
+        median = statistics.median(region.radius_95_deg for region in regions)
+        sources = "; ".join(dict.fromkeys(region.region_source for region in regions))
+        return f"95 % within {median:.3g} deg (median of {len(regions)} answers), {sources}"
+
     def to_json(self, drawn: bool = True, origin: provenance.Environment | None = None) -> JsonObject:
         """Return the content of normals.json; without isophotes and curves where it is not `drawn`.
 

@@ -387,7 +387,7 @@ def test_a_stopped_calibration_goes_on_to_the_same_file(tmp_path, monkeypatch):
     assert other.strata != whole.strata
 
 
-def test_the_command_line_takes_calibrations(tmp_path, monkeypatch):
+def test_the_command_line_takes_calibrations(tmp_path, monkeypatch, capsys):
     calibration(tmp_path, detector="colour")
     monkeypatch.chdir(tmp_path)
     cv2.imwrite("picture.png", np.round(255 * lobes()).astype(np.uint8))
@@ -399,6 +399,8 @@ def test_the_command_line_takes_calibrations(tmp_path, monkeypatch):
     told = json.loads((tmp_path / "out" / "normals.json").read_text())["specularities"]
     assert len(told) == 2
     assert all("peaks" in each["estimates"]["cone_axis"]["region_source"] for each in told)
+    assert "95 % within" in capsys.readouterr().out
+    assert "region_source" in (tmp_path / "out" / "index.html").read_text()
     assert "radius_95_deg" in (tmp_path / "out" / "normals.csv").read_text().splitlines()[0]
 
 
