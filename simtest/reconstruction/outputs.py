@@ -3,6 +3,7 @@
 import csv
 import json
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ import numpy.typing as npt
 
 from simtest.estimators import Estimate
 from simtest.estimators.budget import MISPLACED
+from simtest.estimators.protocol import CalibratedRegion
 from simtest.geometry import BrownConrady, Camera
 from simtest.geometry.vectors import deviation_deg, tangent_basis
 from simtest.reconstruction.overlay import draw_overlay
@@ -28,7 +30,7 @@ COLUMNS = (
     "score", "target", "deviation_deg", "organ_deviation_deg",
 )  # fmt: skip
 
-REGION_COLUMNS = ("radius_68_deg", "radius_95_deg", "region_source")
+REGION_COLUMNS = tuple(field.name for field in fields(CalibratedRegion))
 """Further ones where a core's calibration is given."""
 
 FILES = ("normals.json", "normals.csv", "normals.ply", "overlay.png", "constraints.npz", "index.html")

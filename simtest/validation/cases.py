@@ -5,7 +5,7 @@ import json
 import math
 import shlex
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from simtest.conventions import MOTION_COLUMNS, ON_INSTRUMENT
@@ -288,7 +288,10 @@ def swept_example(cases: list[Case], regions: CoreRegions | None = None) -> "dic
     """Return an example value for each swept, pooled or drawn parameter: the columns that results gain."""
     example: dict[str, Value] = {}
     if regions is not None:
-        example |= {"radius_68_deg": 0.0, "radius_95_deg": 0.0, "region_source": ""}
+        # Imported here: a finished run is recognised without what made it.
+        from simtest.estimators.protocol import CalibratedRegion
+
+        example |= asdict(CalibratedRegion(0.0, 0.0, ""))
     for case in cases:
         example |= case.swept
         example |= dict.fromkeys(case.random, 0.0)
