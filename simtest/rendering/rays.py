@@ -1,6 +1,7 @@
 """Rays through pixels, and the surface points that they hit.
 
-The kernel computes the sightlines of a pinhole itself; those of any other camera come from its `unproject`.
+The kernel computes the sightlines of a pinhole and of an equidistant fisheye itself; those of any other camera come
+from its `unproject`.
 """
 
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry.camera import Camera, ViewMask
+from simtest.geometry.lenses import KannalaBrandt
 from simtest.rendering.backend import dr, mi
 from simtest.rendering.kernel_values import to_kernel
 from simtest.rendering.tissue_kernels import KernelJets, ReliefKernel, turned
@@ -34,6 +36,11 @@ def is_pinhole(camera: Camera) -> bool:
     rays = points @ np.linalg.inv(camera.K).T
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     return np.allclose(camera.unproject(points[..., :2]), rays, rtol=0, atol=1e-12)
+
+
+def is_equidistant(camera: Camera) -> bool:
+    """Return whether a camera's field angles are the distances from its centre, in focal lengths."""
+    return camera.distortion == KannalaBrandt() and type(camera).unproject is Camera.unproject
 
 
 @dataclass(frozen=True)
@@ -65,7 +72,8 @@ class Sightlines:
 
     def __init__(self, camera: Camera, model_from_camera: Array) -> None:
         self.camera = camera
-        self.in_kernel = is_pinhole(camera)
+        self._bends = is_equidistant(camera)
+        self.in_kernel = self._bends or is_pinhole(camera)
         self.pose = model_from_camera
         # Opaque, so that another camera or pose compiles no new kernel.
         self._origin = mi.Vector3d(*model_from_camera[:3, 3].tolist())
@@ -123,7 +131,13 @@ class Sightlines:
             n = self._numbers
             b = (mi.Float64(y) - n["cy"]) * n["fy"]
             a = (mi.Float64(x) - n["cx"] - n["skew"] * b) * n["fx"]
-            sightline = mi.Vector3d(a, b, 1) / dr.sqrt(a * a + b * b + 1)
+            if self._bends:
+                angle = dr.sqrt(a * a + b * b)
+                sine, cosine = dr.sincos(angle)
+                share = dr.select(angle > 0, sine / angle, 1)
+                sightline, active = mi.Vector3d(a * share, b * share, cosine), angle < dr.pi
+            else:
+                sightline = mi.Vector3d(a, b, 1) / dr.sqrt(a * a + b * b + 1)
         else:
             directions = self.camera.unproject(np.stack([np.array(x), np.array(y)], axis=-1).astype(np.float64))
             imaged = np.asarray(np.isfinite(directions).all(axis=-1))

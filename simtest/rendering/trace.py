@@ -17,7 +17,7 @@ from simtest.rendering.frames import Radiance
 from simtest.rendering.instruments import Blockers, InstrumentKernel
 from simtest.rendering.kernel_values import channels, to_kernel
 from simtest.rendering.lighting import DirectLight, Drawer, LightDraw, Material
-from simtest.rendering.rays import TILE, Hit, HitRefinement, Lanes, Pixels, Rays, Sightlines, make_hit, untile
+from simtest.rendering.rays import TILE, Hit, HitRefinement, Lanes, Pixels, Rays, Sightlines, in_tiles, make_hit, untile
 from simtest.rendering.tissue_kernels import ReliefKernel
 from simtest.rendering.truth import CHANNELS, ShapeLabels
 from simtest.runtime.arrays import Array, Image
@@ -216,6 +216,14 @@ class Tracer:
         """
         numbers = range(samples) if numbers is None else numbers
         camera = self.sightlines.camera
+        if camera.seen is not None and bounces is None:
+            # Pixels outside of the view are dark; bounces draw their numbers by place among all.
+            pixels = in_tiles(camera.seen)
+            channels = self._means(self._lanes_of(pixels, seed), samples, numbers, None,
+                                   _share_of(progress, len(pixels) * len(numbers)))  # fmt: skip
+            whole = np.zeros((len(channels), camera.height * camera.width), dtype=channels.dtype)
+            whole[:, pixels] = channels
+            return list(whole.reshape(-1, camera.height, camera.width))
         # Of the frame in whole tiles.
         height, width = (-(-size // TILE) * TILE for size in (camera.height, camera.width))
         # Trace: sums over the samples of each block of pixels.
@@ -228,9 +236,12 @@ class Tracer:
 
     def means_at(self, pixels: Pixels, samples: int, seed: int, tell: Tell | None = None) -> Image:
         """Compute channels, shape (C, N), of `mean` at some pixels by number; `tell` gets the samples traced."""
-        blocks = ((self.sightlines.lanes_of(pixels[first : first + count], seed), count)
-                  for first, count in blocks_of(len(pixels)))  # fmt: skip
-        return self._means(blocks, samples, range(samples), None, tell)
+        return self._means(self._lanes_of(pixels, seed), samples, range(samples), None, tell)
+
+    def _lanes_of(self, pixels: Pixels, seed: int) -> Iterator[tuple[Lanes, int]]:
+        """Return lanes of pixels by number, launch by launch, and how many these are."""
+        for first, count in blocks_of(len(pixels)):
+            yield self.sightlines.lanes_of(pixels[first : first + count], seed), count
 
     def _means(
         self,
