@@ -110,11 +110,14 @@ def check_motion(scene: Scene, surface: SurfaceModel) -> None:
 
 def _check_rims(scene: Scene, surface: SurfaceModel, positions: Array) -> None:
     """Raise `InputError` where the rim of a source, or what it encloses, touches tissue."""
-    for i, light in enumerate(scene.rig.lights):
-        if light.source is None:
-            continue
-        points = _rim_points(light, positions[i])
-        clearances = _clearances(surface, points)
+    rims = {i: _rim_points(light, positions[i]) for i, light in enumerate(scene.rig.lights) if light.source}
+    if not rims:
+        return
+    every = _clearances(surface, np.concatenate(list(rims.values())))
+    ends = np.cumsum([len(points) for points in rims.values()])[:-1]
+    for (i, points), clearances in zip(rims.items(), np.split(every, ends), strict=True):
+        light = scene.rig.lights[i]
+        assert light.source is not None
         worst = int(np.argmin(clearances))
         if not clearances[worst] > 0:
             position = ", ".join(f"{value:.4g}" for value in points[worst])

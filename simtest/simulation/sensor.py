@@ -9,12 +9,13 @@ import io
 import math
 from collections.abc import Callable
 from fractions import Fraction
+from functools import lru_cache
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import srgb_encode
+from simtest.calibration import AngularProfile, srgb_encode
 from simtest.calibration.calibration import falloff_map, mean_channel
 from simtest.errors import InputError
 from simtest.geometry import Camera, smooth
@@ -98,8 +99,14 @@ def collect(radiance: Image, sensor: Sensor, camera: Camera) -> Image:
     vignetting = sensor.vignetting.model()
     if vignetting.is_uniform:
         return light
-    share = falloff_map(camera, vignetting).astype(np.float32)
+    share = _falloff(camera, vignetting)
     return np.asarray(light * (share if light.ndim == 2 else share[:, :, None]), dtype=np.float32)
+
+
+@lru_cache(maxsize=1)
+def _falloff(camera: Camera, vignetting: AngularProfile) -> Image:
+    """Return the share of light at each pixel, shape (H, W): a frame asks for it twice."""
+    return falloff_map(camera, vignetting).astype(np.float32)
 
 
 def capture(

@@ -121,6 +121,14 @@ class Stalk:
 
     def undo(self, points: Array) -> Array:
         """Return where points, shape (N, 3), mm, come from, to rounding."""
+        near = np.flatnonzero(self.moves(points))
+        if not near.size:
+            return points
+        source = points.copy()
+        source[near] = self._undone(points[near])
+        return source
+
+    def _undone(self, points: Array) -> Array:
         # The stricture first, at the known height z'; then the lift, at the distance from the axis found there.
         z, x = self._split(points)
         length = np.linalg.norm(x, axis=1)
@@ -189,6 +197,8 @@ def _bisect(function: Callable[[Array], Array], target: Array, low: Array, high:
     """Solve function(x) = target for a rising function between bounds, each of shape (N,)."""
     for _ in range(_STEPS):
         middle = (low + high) / 2
+        if ((middle == low) | (middle == high)).all():
+            break
         below = function(middle) < target
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     return (low + high) / 2

@@ -296,7 +296,7 @@ def test_frames_labels_and_truth_through_a_masked_lens(session, surface, lens, s
     camera = SMALL | {"distortion": {"type": "kannala_brandt"}, "view_mask": mask} | lens
     tables = {"surface": surface, "camera": camera, "render": {"samples_per_pixel": samples}}
     session.update(scene_from_dict({**tables, "reflectance": {"type": "phong", "diffuse": 0.3}}))
-    assert session.sightlines.in_kernel == (session.camera.distortion is None)
+    assert session.sightlines.in_kernel == (not isinstance(session.camera.distortion, BrownConrady))
     model, frame, truth = session.camera, session.frame(), session.truth()
     x, y = model.pixel_centres().transpose(2, 0, 1)
     np.testing.assert_array_equal(model.seen, np.hypot(x - 83.0, y - 60.0) <= 50)
@@ -319,6 +319,22 @@ def test_frames_labels_and_truth_through_a_masked_lens(session, surface, lens, s
 
 
 @pytest.mark.render
+def test_pixels_in_view_are_those_of_the_whole_frame(session):
+    """Those outside of the view are not traced; the others have the same sample points."""
+    lens = {**SMALL, "width": 90, "height": 70, "distortion": {"type": "kannala_brandt"}}
+    tables = {"surface": COLON, "reflectance": {"type": "phong", "diffuse": 0.3}, "render": {"samples_per_pixel": 3}}
+    session.update(scene_from_dict({**tables, "camera": lens}))
+    whole = session.radiance()
+    session.update(scene_from_dict({**tables, "camera": lens | {"view_mask": {"radius": 31}}}))
+    part, seen = session.radiance(), session.camera.seen
+    for name in ("specular", "diffuse"):
+        a, b = getattr(part, name), getattr(whole, name)
+        np.testing.assert_allclose(a[seen], b[seen], rtol=1e-6)
+        assert not a[~seen].any()
+        assert b[~seen].any()
+
+
+@pytest.mark.render
 def test_a_view_of_one_pixel_is_that_pixel(session):
     camera = {"width": 40, "height": 30, "fx": 40.0, "fy": 40.0, "view_mask": {"radius": 0.6, "cx": 20.5, "cy": 15.5}}
     tables = {"surface": {"type": "plane"}, "reflectance": {"type": "phong", "diffuse": 1.0}}
@@ -328,9 +344,10 @@ def test_a_view_of_one_pixel_is_that_pixel(session):
 
 
 @pytest.mark.render
+@pytest.mark.parametrize("lens", [{}, {"distortion": {"type": "kannala_brandt"}}], ids=str)
 @pytest.mark.parametrize("samples", [1, 3])
-def test_rays_that_are_given_trace_as_those_made_in_the_kernel(session, samples):
-    tables = {"surface": {"type": "sphere", "radius_mm": 6.0}, "camera": {**PINHOLE, "skew": 1.5}}
+def test_rays_that_are_given_trace_as_those_made_in_the_kernel(session, samples, lens):
+    tables = {"surface": {"type": "sphere", "radius_mm": 6.0}, "camera": {**PINHOLE, "skew": 1.5, **lens}}
     render = {"samples_per_pixel": samples, "seed": 2}
     session.update(scene_from_dict({**tables, "reflectance": {"type": "phong", "diffuse": 0.3}, "render": render}))
     expected = session.frame()
@@ -347,7 +364,7 @@ def test_rays_that_are_given_trace_as_those_made_in_the_kernel(session, samples)
     np.testing.assert_allclose(given.labels.depth[inside], expected.labels.depth[inside], rtol=1e-4)
 
 
-def test_only_a_pinhole_has_its_rays_made_in_the_kernel():
+def test_only_a_pinhole_counts_as_one():
     """Whatever its class: a lens may turn its outer sightlines inwards, or have none beyond a radius."""
 
     class Lens(Camera):
