@@ -549,7 +549,9 @@ def _shape_operators(points: Array, normals: Array) -> Array:
     gap, turn = gap * near[..., None], turn * near[..., None]
     # Damped along the normal, along which the gaps say nothing.
     moment = np.einsum("nki,nkj->nij", gap, gap)
-    scale = np.trace(moment, axis1=1, axis2=2)[:, None, None] + np.finfo(float).tiny
+    scale = np.trace(moment, axis1=1, axis2=2)[:, None, None]
+    # A node alone on its side of a thin wall counts as flat.
+    scale = np.where(scale > 0, scale, 1.0)
     damped = moment + scale * (normals[:, :, None] * normals[:, None, :] + 1e-6 * np.eye(3))
     S = np.einsum("nki,nkj->nij", turn, gap) @ np.linalg.inv(damped)
     across = projector(normals)

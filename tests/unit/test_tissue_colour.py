@@ -563,3 +563,18 @@ def test_bounces_find_stool_without_its_lobe():
     soiled = bounced(**black, debris={"stool": 0.5, "stool_colour": [0.0, 0.0, 0.0]})
     # Nothing but the lobe reflects; both of its bounces must miss the stool.
     assert 0.1 < soiled / bounced(**black) < 0.5
+
+
+def test_a_node_alone_on_its_side_of_a_wall_counts_as_flat():
+    """On a bowl the curvature is 1/12; one more node, whose neighbours all face the other way, has none."""
+    rng = np.random.default_rng(5)
+    normals = rng.normal(size=(400, 3)) * [0.2, 0.2, 0] + [0, 0, 1]
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    points = 12 * normals
+    alone = np.vstack([points, [[0.0, 0.0, 12.0]]]), np.vstack([normals, [[0.0, 0.0, -1.0]]])
+    bent = vessels._shape_operators(*alone)
+    np.testing.assert_array_equal(bent[-1], 0)
+    # Where the neighbours are near on all sides the fit is that of a sphere.
+    inner = normals[:, 2] > 0.99
+    across = np.eye(3) - normals[inner, :, None] * normals[inner, None, :]
+    np.testing.assert_allclose(bent[:-1][inner], across / 12, atol=2e-3)
