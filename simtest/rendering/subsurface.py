@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from simtest.geometry import Camera
-from simtest.runtime.arrays import Array, Image
+from simtest.runtime.arrays import Array, Image, kept
 from simtest.spec.reflectance import Translucency
 
 LEVELS_PX = tuple(2.0**i for i in range(8))
@@ -143,6 +143,11 @@ def _fitted(spec: Translucency, channels: int, first: int, last: int) -> Array:
     Returns the weights of the sharp image and of each level, of sum 1, shape (scales, 1 + levels, channels), at the
     scales 2^(i / `SCALES_PER_OCTAVE`) px/mm, i from `first` to `last`.
     """
+    key = f"{spec!r} {channels} {first} {last}"
+    return kept("translucency", key, lambda: {"weights": _fit(spec, channels, first, last)})["weights"]
+
+
+def _fit(spec: Translucency, channels: int, first: int, last: int) -> Array:
     from scipy.optimize import nnls
 
     waves = np.geomspace(0.02, 40, 80)

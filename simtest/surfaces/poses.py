@@ -11,8 +11,8 @@ from typing import TypeVar
 
 import igl
 import numpy as np
+import scipy
 from numpy.random import Generator
-from scipy import ndimage, sparse
 
 from simtest.errors import InputError
 from simtest.geometry.vectors import tangent_basis, unit
@@ -218,7 +218,7 @@ def _inside_cells(mesh: TriangleMesh, pitch: float) -> tuple[IntArray, Array]:
         np.ascontiguousarray(corner + pitch * grid.reshape(-1, 3)),
     )
     inside = np.abs(np.asarray(winding)).reshape(counts) > 0.5
-    labels, count = ndimage.label(inside, np.ones((3, 3, 3)))
+    labels, count = scipy.ndimage.label(inside, np.ones((3, 3, 3)))
     if count > 1:
         # The largest cavity; label 0 is the outside.
         inside = labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
@@ -240,11 +240,11 @@ def _roomiest_route(cells: IntArray, room: Array) -> IntArray:
         length.append(np.full(len(here), math.sqrt(sum(s * s for s in step))))
     i, j, steps = np.concatenate(first), np.concatenate(second), np.concatenate(length)
 
-    def graph(weights: Array) -> sparse.csr_matrix:
-        return sparse.csr_matrix((weights, (i, j)), shape=(len(cells), len(cells)))
+    def graph(weights: Array) -> "scipy.sparse.csr_matrix":
+        return scipy.sparse.csr_matrix((weights, (i, j)), shape=(len(cells), len(cells)))
 
     def farthest(start: int) -> int:
-        distance = sparse.csgraph.dijkstra(graph(steps), directed=False, indices=start)
+        distance = scipy.sparse.csgraph.dijkstra(graph(steps), directed=False, indices=start)
         return int(np.argmax(np.where(np.isfinite(distance), distance, -1.0)))
 
     # Farthest from the roomiest cell is one end, farthest from that one the other.
@@ -252,7 +252,7 @@ def _roomiest_route(cells: IntArray, room: Array) -> IntArray:
     end = farthest(start)
     # Cubed, so that a detour through the middle is cheaper than a short cut along the wall.
     cost = steps / np.maximum((room[i] + room[j]) / 2, 1e-3) ** 3
-    _, before = sparse.csgraph.dijkstra(graph(cost), directed=False, indices=start, return_predecessors=True)
+    _, before = scipy.sparse.csgraph.dijkstra(graph(cost), directed=False, indices=start, return_predecessors=True)
     route = [end]
     while route[-1] != start and before[route[-1]] >= 0:
         route.append(int(before[route[-1]]))
@@ -262,7 +262,7 @@ def _roomiest_route(cells: IntArray, room: Array) -> IntArray:
 def _resampled(rough: Array, pitch: float) -> Array:
     """Smooth a row of points and space it evenly by `STEP_MM`."""
     for width in (pitch, SMOOTHING_MM):
-        rough = np.asarray(ndimage.gaussian_filter1d(_evenly(rough), width / STEP_MM, axis=0, mode="nearest"))
+        rough = np.asarray(scipy.ndimage.gaussian_filter1d(_evenly(rough), width / STEP_MM, axis=0, mode="nearest"))
     return _evenly(rough)
 
 
@@ -291,10 +291,10 @@ def _without_ends(path: Array, room: Array) -> Array:
 
 def _longest_run(flags: Mask) -> slice:
     """Return the longest run of true values."""
-    labels, count = ndimage.label(flags)
+    labels, count = scipy.ndimage.label(flags)
     if not count:
         return slice(0, 0)
-    return ndimage.find_objects(labels)[int(np.argmax(np.bincount(labels)[1:]))][0]
+    return scipy.ndimage.find_objects(labels)[int(np.argmax(np.bincount(labels)[1:]))][0]
 
 
 def _sides(tangents: Array) -> Array:

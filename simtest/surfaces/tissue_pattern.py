@@ -15,8 +15,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
-from scipy.spatial import cKDTree
+import scipy
 
 from simtest.runtime.arrays import AnyArray, Array, kept
 from simtest.spec.reflectance import TissueColour
@@ -112,7 +111,7 @@ class Lattice:
     def at(self, points: Array) -> Array:
         """Return the field at points, shape (N, 3), model frame, mm."""
         cells = points @ self.lattice_from_model.T
-        return np.asarray(ndimage.map_coordinates(self.values, cells.T, order=1, mode="grid-wrap"))
+        return np.asarray(scipy.ndimage.map_coordinates(self.values, cells.T, order=1, mode="grid-wrap"))
 
 
 @dataclass(frozen=True)
@@ -254,7 +253,7 @@ def _net(spacing: float, rng: np.random.Generator) -> Lattice:
     side = NODES / MESH_NODES
     centres = _apart(rng, side)
     grid = np.stack(np.meshgrid(*[np.arange(NODES) / MESH_NODES] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    distance, nearest = cKDTree(centres, boxsize=side).query(grid, k=2)
+    distance, nearest = scipy.spatial.cKDTree(centres, boxsize=side).query(grid, k=2)
     apart = centres[nearest[:, 0]] - centres[nearest[:, 1]]
     apart -= side * np.round(apart / side)
     # Distance to the plane halfway between the two nearest centres
@@ -268,7 +267,7 @@ def _apart(rng: np.random.Generator, side: float) -> Array:
     centres = rng.uniform(0, side, (round(side**3), 3))
     for _ in range(8):
         # Each moves away from its nearest neighbour.
-        distance, other = cKDTree(centres, boxsize=side).query(centres, k=2)
+        distance, other = scipy.spatial.cKDTree(centres, boxsize=side).query(centres, k=2)
         gap = centres - centres[other[:, 1]]
         gap -= side * np.round(gap / side)
         push = np.clip(0.9 - distance[:, 1], 0, None) / (2 * distance[:, 1])

@@ -446,7 +446,9 @@ def _grow(
     return position, normal, parent, spec.smallest_mm / 2 * np.cbrt(carried)
 
 
-def _neighbours(points: Array, normals: Array, tortuosity: float, rng: np.random.Generator) -> scipy.sparse.csr_matrix:
+def _neighbours(
+    points: Array, normals: Array, tortuosity: float, rng: np.random.Generator
+) -> "scipy.sparse.csr_matrix":
     """Return the costs of edges between neighbouring nodes, a symmetric sparse matrix."""
     distance, other = _nearest(points)
     first, second = np.repeat(np.arange(len(points)), distance.shape[1] - 1), other[:, 1:].ravel()
@@ -482,7 +484,7 @@ def _roots(points: Array, count: int, rng: np.random.Generator) -> IntArray:
     return np.unique(chosen)
 
 
-def _trees(graph: scipy.sparse.csr_matrix, roots: IntArray, ends: Mask) -> tuple[IntArray, IntArray]:
+def _trees(graph: "scipy.sparse.csr_matrix", roots: IntArray, ends: Mask) -> tuple[IntArray, IntArray]:
     """Return each node's parent, -1 for roots and what is not reached, and the nodes reached, from the roots on."""
     cost = graph.copy()
     row = np.repeat(np.arange(graph.shape[0]), np.diff(graph.indptr))
