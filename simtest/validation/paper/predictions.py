@@ -1,7 +1,5 @@
 """What is predicted of the published protocol: the bias of circle pose under smoothing, and the Cramer-Rao bound."""
 
-from functools import lru_cache
-
 import numpy as np
 
 from simtest.errors import Failure
@@ -90,7 +88,6 @@ LARGEST_RAD = 0.5
 """The bound holds for small angles."""
 
 
-@lru_cache(maxsize=1)
 def cramer_rao_bound(setting: PaperSetting) -> float | None:
     """Compute the bound on the RMS angle between estimated and true normal (theory.md section 2).
 
