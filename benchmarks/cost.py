@@ -25,7 +25,6 @@ from simtest.dataset.shard import PART, finish, write_sample
 from simtest.runtime.arrays import Array
 from simtest.spec import load_dataset
 from simtest.spec.recipes import Dataset
-from simtest.spec.spec_model import validate
 
 FRAMES = 10**7
 ANATOMIES, SAMPLES = 4, 5
@@ -39,24 +38,6 @@ CORE_HOUR, TB_MONTH = 0.04, 20.0
 """Prices that the table assumes, in any currency: of a core for an hour, and of a TB for a month."""
 
 LINEAR = 0.9
-
-TISSUE = {
-    "name": "tissue",
-    "title": "Colon and liver with relief, film, vessels and sources of their true size",
-    "samples_per_anatomy": 20,
-    "families": [
-        {
-            "scene": scene,
-            "weight": weight,
-            "seeds": {"high": 99999},
-            "per_sample": {
-                "surface.viewpoint": {"low": 0, "high": 1000000, "integer": True},
-                "surface.relief.seed": {"low": 0, "high": 2**32 - 1, "integer": True},
-            },
-        }
-        for scene, weight in (("tissue_colon", 2.0), ("tissue_liver", 1.0))
-    ],
-}
 
 
 @dataclass(frozen=True)
@@ -93,9 +74,7 @@ class Measured:
 def recipes() -> dict[str, Dataset]:
     """Return the recipes that are costed, with seeds that no run had before: nothing of them is kept in any folder."""
     seed = int.from_bytes(os.urandom(4), "little")
-    smooth = load_dataset("smooth", {"seed": seed})
-    tissue = validate(Dataset, {**TISSUE, "samples": 1000, "seed": seed}, "tissue")
-    return {"smooth": smooth, "tissue": tissue}
+    return {name: load_dataset(name, {"seed": seed}) for name in ("smooth", "endoscopy")}
 
 
 def measure(dataset: Dataset, anatomies: int = ANATOMIES, samples: int = SAMPLES) -> Measured:

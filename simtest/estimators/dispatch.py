@@ -63,7 +63,8 @@ def run_each(
     """
     sound = [patch for patch in patches if not isinstance(patch, Failure)]
     results: Sequence[Estimate | Failure] | None = None
-    if isinstance(estimator, BatchEstimator) and len(sound) > 1:
+    # A protocol's isinstance is slow.
+    if len(sound) > 1 and isinstance(estimator, BatchEstimator):
         results = _batch(estimator, sound, camera, priors)
     if results is None:
         results = [run(estimator, patch, camera, priors) for patch in sound]
@@ -75,7 +76,7 @@ def prepare(estimators: Sequence[AnyEstimator], patches: Sequence[Patch | Failur
     """Let estimators fit what they share to several patches at once (`PreparedEstimator`)."""
     sound = [patch for patch in patches if not isinstance(patch, Failure)]
     for estimator in estimators:
-        if isinstance(estimator, PreparedEstimator) and len(sound) > 1:
+        if len(sound) > 1 and isinstance(estimator, PreparedEstimator):
             # What fails here fails again, with its reason, at the highlight that it comes from.
             with contextlib.suppress(Exception):
                 estimator.prepare(sound, camera)

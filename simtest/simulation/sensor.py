@@ -174,17 +174,18 @@ def encode(frame: Image, sensor: Sensor, seen: Mask | None = None) -> Image:
         picture = denoise(picture, sensor.denoising)
     if sensor.sharpening is not None:
         picture = sharpen(picture, sensor.sharpening)
-        picture = np.clip(picture, 0.0, 1.0) if sensor.clips else picture
+        picture = np.clip(picture, 0.0, 1.0, out=picture) if sensor.clips else picture
     if sensor.scaling is None and sensor.interlacing is not None:
         picture = weave(picture, sensor.interlacing)
     if sensor.scaling is not None:
         picture = rescale(picture, sensor.scaling, sensor.interlacing)
-        picture = np.clip(picture, 0.0, 1.0) if sensor.clips else picture
+        picture = np.clip(picture, 0.0, 1.0, out=picture) if sensor.clips else picture
     if sensor.overlay is not None:
         picture = draw(picture, sensor.overlay, seen)
     if sensor.coding is None:
         return _quantised(picture, sensor.bits)
-    coded = code(np.rint(picture * np.float32(255)).astype(np.uint8), sensor.coding)
+    levels = picture * np.float32(255)
+    coded = code(np.rint(levels, out=levels).astype(np.uint8), sensor.coding)
     return np.asarray(cv2.LUT(coded, LEVELS))
 
 
@@ -204,7 +205,9 @@ def _electrons(frame: Image, sensor: Sensor, rng: np.random.Generator | None) ->
         raise ValueError("shot noise needs a generator")
     if sensor.is_processed:
         # A picture to look at, in single precision; plain frames, of which errors are measured, keep NumPy's numbers.
-        levels = poisson(np.maximum(frame, 0) * np.float32(full_well), rng)
+        levels = np.maximum(frame, 0)
+        levels *= np.float32(full_well)
+        levels = poisson(levels, rng)
         levels *= np.float32(1 / full_well)
         if read_noise > 0:
             noise = rng.standard_normal(levels.shape, dtype=np.float32)
@@ -343,9 +346,11 @@ def demosaic(plane: Image, mosaic: Mosaic) -> Image:
         root = cv2.demosaicing(values, getattr(cv2, f"COLOR_Bayer{pattern}2RGB_VNG")).astype(np.float32)
         return np.square(root / np.float32(_8_BITS))
     suffix = "_EA" if mosaic.demosaicing == "edge_aware" else ""
-    values = np.rint(clipped * np.float32(_16_BITS)).astype(np.uint16)
-    filled = cv2.demosaicing(values, getattr(cv2, f"COLOR_Bayer{pattern}2RGB{suffix}"))
-    return np.asarray(filled.astype(np.float32) / np.float32(_16_BITS))
+    clipped *= np.float32(_16_BITS)
+    values = np.rint(clipped, out=clipped).astype(np.uint16)
+    filled = cv2.demosaicing(values, getattr(cv2, f"COLOR_Bayer{pattern}2RGB{suffix}")).astype(np.float32)
+    filled /= np.float32(_16_BITS)
+    return np.asarray(filled)
 
 
 def as_seen_by_sensor(frame: Image, colour: ColourProcessing) -> Image:
@@ -386,8 +391,11 @@ def sharpen(picture: Image, sharpening: Sharpening) -> Image:
     """Return an encoded picture whose luma was unsharp masked; all channels change alike. It is not clipped."""
     value = luma(picture)
     smooth = cv2.GaussianBlur(value, (0, 0), sharpening.radius_px, borderType=cv2.BORDER_REFLECT_101)
-    change = np.float32(sharpening.amount) * (value - smooth)
-    return np.asarray(cv2.add(picture, change if picture.ndim == 2 else cv2.merge([change] * 3)))
+    # In place: fresh arrays of a large picture cost more than the arithmetic.
+    change = np.subtract(value, smooth, out=smooth)
+    change *= np.float32(sharpening.amount)
+    change = change if picture.ndim == 2 else np.asarray(cv2.merge([change] * 3))
+    return np.asarray(cv2.add(picture, change, dst=change))
 
 
 def weave(picture: Image, interlacing: Interlacing) -> Image:

@@ -131,12 +131,16 @@ def _published(part: Part) -> list[Row]:
     seeds = [case.noise_seed(experiment, number) for number in part.numbers]
     if part.item:
         save_realisation(part.item, experiment, case, part.numbers[0])
-    # The bound is that of the light at V.
-    bound = cramer_rao_bound(setting) if setting.eps == 0 else None
-    bound_deg = None if bound is None else float(np.degrees(bound))
-    swept = {**case.paper_columns(), **case.swept, "bound_deg": bound_deg}
+    swept = {**case.paper_columns(), **case.swept, "bound_deg": _bound_deg(setting)}
     common: Row = {"experiment": experiment.name, "label": case.label, "setting": case.setting, **swept_columns(swept)}
     return paper_rows(setting, common, part.numbers, seeds, experiment.estimators)
+
+
+@lru_cache(maxsize=1)
+def _bound_deg(setting: PaperSetting) -> float | None:
+    """Return the bound of a setting, whose parts all state it: that of the light at V."""
+    bound = cramer_rao_bound(setting) if setting.eps == 0 else None
+    return None if bound is None else float(np.degrees(bound))
 
 
 class CaseOf(NamedTuple):

@@ -115,8 +115,17 @@ def _enclosed(specularity: Specularity, points: Array) -> list[int]:
     near, patch = np.flatnonzero(inside).tolist(), specularity.patch
     if not near or isinstance(patch, Failure):
         return near
-    contour = patch.isophote(HIGHLIGHT_ISOVALUE)
-    return near if isinstance(contour, Failure) else [j for j in near if encloses(contour, points[j])]
+    if patch.area_px(HIGHLIGHT_ISOVALUE) is None:
+        return near
+    # The border passes between pixel centres: where the four around a point agree, it need not be traced.
+    sides = np.pad(patch.inside(HIGHLIGHT_ISOVALUE), 1)
+    found = []
+    for j in near:
+        column, row = np.floor(points[j] - PIXEL_CENTRE - patch.origin_px).astype(int) + 1
+        around = sides[max(row, 0) : row + 2, max(column, 0) : column + 2]
+        if around.all() if around.all() == around.any() else encloses(patch.isophote(HIGHLIGHT_ISOVALUE), points[j]):
+            found.append(j)
+    return found
 
 
 MISSED = "missed"

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import map_coordinates
+from scipy.sparse import csr_array
 
 from simtest.calibration import estimate_noise
 from simtest.conventions import PIXEL_CENTRE
@@ -51,12 +51,16 @@ def texture(setting: PaperSetting, light: Array) -> Array:
     """
     side = np.arange(setting.size) + PIXEL_CENTRE - setting.size / 2
     centre = window_centre(setting, light)
-    x, y = side + centre[0], (side + centre[1])[:, None]
-    # `isocurves.cosine_beta` for V over the origin: every factor is a sum of one in x and one in y.
-    product = x * (light[0] - x) + (y * (light[1] - y) + light[2] * setting.height)
-    to_mirrored = (light[0] - x) ** 2 + ((light[1] - y) ** 2 + light[2] ** 2)
-    to_camera = x**2 + (y**2 + setting.height**2)
-    return np.asarray((np.maximum(product, 0) / np.sqrt(to_mirrored * to_camera)) ** setting.exponent)
+    x, powers = side + centre[0], []
+    # By bands of rows and in place: fresh arrays of the whole size cost more than the arithmetic.
+    for y in np.array_split((side + centre[1])[:, None], 8):
+        # `isocurves.cosine_beta` for V over the origin: every factor is a sum of one in x and one in y.
+        cosine2 = np.maximum(x * (light[0] - x) + (y * (light[1] - y) + light[2] * setting.height), 0)
+        np.square(cosine2, out=cosine2)
+        cosine2 /= (light[0] - x) ** 2 + ((light[1] - y) ** 2 + light[2] ** 2)
+        cosine2 /= x**2 + (y**2 + setting.height**2)
+        powers.append(np.power(cosine2, setting.exponent / 2, out=cosine2))
+    return np.concatenate(powers)
 
 
 def window_centre(setting: PaperSetting, light: Array) -> Array:
@@ -76,14 +80,27 @@ def sample_positions(setting: PaperSetting, box: Box) -> Array:
     return np.asarray(np.nan_to_num(np.moveaxis(samples[..., ::-1], -1, 0), nan=-2.0))
 
 
-def picture(setting: PaperSetting, light: Array, positions: Array | None = None) -> Array:
-    """Warp the texture into the slanted view, bilinear: the noise-free picture, 0 outside the window.
+def warp(setting: PaperSetting, box: Box) -> csr_array:
+    """Return the matrix from the texture's samples to a box of the picture, row by row: bilinear, 0 outside."""
+    size = setting.size
+    positions = sample_positions(setting, box).reshape(2, -1)
+    row, column = first = np.clip(np.floor(positions), 0, size - 2).astype(np.intp)
+    down, right = positions - first
+    weights = np.array([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right])
+    weights *= ((positions >= 0) & (positions <= size - 1)).all(axis=0)
+    samples = row * size + column + np.array([[0], [1], [size], [size + 1]])
+    ends = np.arange(0, weights.size + 1, 4)
+    return csr_array((weights.T.ravel(), samples.T.ravel(), ends), shape=(len(row), size**2))
 
-    `positions`, shape (2, h, w), are the `sample_positions` of a part of the picture; default of all of it.
+
+def picture(setting: PaperSetting, light: Array, box: Box | None = None, warped: csr_array | None = None) -> Array:
+    """Warp the texture into a box of the slanted view, default all of it: the noise-free picture, 0 outside the window.
+
+    `warped` is the box's `warp`, where it is known.
     """
-    if positions is None:
-        positions = sample_positions(setting, (0, 0, setting.size, setting.size))
-    return np.asarray(map_coordinates(texture(setting, light), positions, order=1, cval=0.0, prefilter=False))
+    box = box or (0, 0, setting.size, setting.size)
+    matrix = warp(setting, box) if warped is None else warped
+    return np.asarray((matrix @ texture(setting, light).ravel()).reshape(box[3], box[2]))
 
 
 def region_of_interest(setting: PaperSetting) -> Box:
@@ -149,8 +166,8 @@ class Pipeline:
         self.region = region_of_interest(setting)
         self.outer = _grown(self.region, kernel_radius(setting), setting.size)
         self._overhead = np.array([0.0, 0.0, setting.height])
-        self.positions = sample_positions(setting, self.outer)
-        self._fixed = picture(setting, self._overhead, self.positions) if setting.eps == 0 else None
+        self._warp = warp(setting, self.outer)
+        self._fixed = picture(setting, self._overhead, self.outer, self._warp) if setting.eps == 0 else None
 
     def realise(self, generators: Iterable[np.random.Generator]) -> dict[str, list[Estimate | Failure]]:
         """Make a realisation with each generator; return the Estimate or Failure of each by estimator name.
@@ -174,7 +191,7 @@ class Pipeline:
         light, clean = self._overhead, self._fixed
         if clean is None:
             light = draw_light(setting, rng)
-            clean = picture(setting, light, self.positions)
+            clean = picture(setting, light, self.outer, self._warp)
         # Noise; smoothed in double precision, since in single precision the normal moves by up to 2e-5 deg.
         noisy = smoothed = clean + setting.sigma * rng.standard_normal(clean.shape, dtype=np.float32)
         if setting.smoothing_px > 0:
