@@ -123,9 +123,11 @@ def kept_file(folder: Path, name: str, scene: Scene, variant: str) -> Path:
 
 def keep_truth(path: Path, truth: FrameTruth, brightest_mm: float | None) -> None:
     """Write the truth at a frame's scored pixels, without loss, and its picture; `brightest_mm` is what it is told."""
-    arrays = {"scored": truth.scored, "zone": truth.zone, "image": truth.image, "distance": truth.distance[truth.scored],
-              "excluded": [truth.excluded[reason] for reason in EXCLUDED],
-              "brightest_mm": np.nan if brightest_mm is None else brightest_mm}  # fmt: skip
+    arrays = {
+        "scored": truth.scored, "zone": truth.zone, "image": truth.image, "distance": truth.distance[truth.scored],
+        "excluded": [truth.excluded[reason] for reason in EXCLUDED],
+        "brightest_mm": np.nan if brightest_mm is None else brightest_mm,
+    }  # fmt: skip
     for surface in SURFACES:
         arrays[f"normal_{surface}"] = truth.normal[surface][truth.scored]
         arrays[f"curvature_{surface}"] = truth.curvature[surface][truth.scored]
