@@ -138,7 +138,8 @@ def keep_truth(path: Path, truth: FrameTruth, brightest_mm: float | None) -> Non
 def read_truth(path: Path, name: str, scene: Scene, setting: str, swept: Mapping[str, object]) -> FrameTruth:
     """Return a kept truth of a frame of a scene; maps are NaN where nothing is scored."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # Opened here: NumPy leaves a damaged file open.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             held = {key: file[key] for key in file.files}
     except (ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: cannot be read ({error}); without its folder all is rendered again") from error
