@@ -1,6 +1,7 @@
 """`simtest score` of maps, from the command line, on rendered frames: tissue, a lens, a view mask, an instrument."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -11,7 +12,11 @@ from simtest.cli.runs import WORDS
 from simtest.dataset.scoring.dense import score
 from simtest.dataset.scoring.dense.maps import METHODS
 from simtest.dataset.scoring.dense.score import frames_of
+from simtest.dataset.scoring.dense.truth import SURFACES
+from simtest.errors import InputError
 from simtest.rendering.bitmap import write_exr
+from simtest.spec import calibration_toml
+from simtest.validation.run_folder import TRUTH
 
 pytestmark = pytest.mark.render
 
@@ -89,6 +94,35 @@ def test_flipped_maps_of_rendered_frames_score_their_turn(run, here, maps, tmp_p
     assert cells["base"][0]["mean"] > 1.5
     assert record["counts"]["scored"] == sum(int(truth.scored.sum()) for truth in truths)
     assert "wall" not in json.dumps(record["counts"])
+
+
+def test_the_truth_that_an_export_kept_is_that_of_the_frames_rendered_again(run, tmp_path):
+    folder, kept = run
+    shutil.copytree(folder, tmp_path / "run")
+    assert len([*(tmp_path / "run" / TRUTH).iterdir()]) == len(kept)
+    shutil.rmtree(tmp_path / "run" / TRUTH)
+    for one, again in zip(kept, frames_of(tmp_path / "run"), strict=True):
+        where = again.scored
+        np.testing.assert_array_equal(one.scored, where)
+        np.testing.assert_array_equal(one.distance[where], again.distance[where])
+        for surface in SURFACES:
+            np.testing.assert_array_equal(one.normal[surface][where], again.normal[surface][where])
+            np.testing.assert_array_equal(one.curvature[surface][where], again.curvature[surface][where])
+        np.testing.assert_array_equal(one.zone, again.zone)
+        np.testing.assert_array_equal(one.image, again.image)
+        assert calibration_toml(one.calibration) == calibration_toml(again.calibration)
+        for name in ("name", "eps", "excluded", "setting", "swept", "scene"):
+            assert getattr(one, name) == getattr(again, name)
+
+
+def test_a_kept_truth_is_read_without_rendering_and_a_damaged_one_is_told(run, tmp_path, monkeypatch):
+    shutil.copytree(run[0], tmp_path / "run")
+    monkeypatch.setattr(score, "scored_frames", None)
+    assert len([*frames_of(tmp_path / "run")]) == len(run[1])
+    for file in (tmp_path / "run" / TRUTH).iterdir():
+        file.write_bytes(file.read_bytes()[:1000])
+    with pytest.raises(InputError, match="cannot be read"):
+        list(frames_of(tmp_path / "run"))
 
 
 @pytest.mark.slow
