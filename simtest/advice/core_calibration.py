@@ -51,7 +51,7 @@ ORDER: tuple[Feature, ...] = ("sigma_deg", "score", "flags", "radius_px", "borde
 RECIPE = "endoscopy"
 """Dataset recipe whose ranges reach over real frames."""
 
-FOLDS, RIDGE, SHRINKAGE = 10, 0.05, 0.1
+FOLDS, SETS, RIDGE, SHRINKAGE = 10, 1000, 0.05, 0.3
 """The last two of the expected error's weights and of the frames' statistics, over a variance of 1."""
 
 # Answers to frames ----------------------------------------------------------------------------------------------------
@@ -201,7 +201,8 @@ def _parted(
 def shift_of(statistics: Array) -> Shift:
     """Find how far off frames of the calibration are, by their statistics, shape (frames, S), NaN where not told.
 
-    The centre and covariance are those of one half of the frames, the limit is the conformal quantile of the other's.
+    The centre and covariance are those of one half of the frames, the limit is the conformal quantile of the other's;
+    of several frames together that of sets drawn from these.
     """
     first, second = statistics[::2], statistics[1::2]
     told = np.isfinite(first)
@@ -211,9 +212,11 @@ def shift_of(statistics: Array) -> Shift:
     scaled = off / spread
     values, vectors = np.linalg.eigh((1 - SHRINKAGE) * np.cov(scaled.T) + SHRINKAGE * np.eye(len(centre)))
     whitening = (vectors / np.sqrt(values)).T / spread
-    found = Shift(centre=tuple(centre), whitening=tuple(map(tuple, whitening)), limit=0.0)
-    off = np.array([found.distance(each) for each in second])
-    return found.model_copy(update={"limit": quantile(off, np.arange(len(off)), regions.LEVELS[1])})
+    found = Shift(centre=tuple(centre), whitening=tuple(map(tuple, whitening)), limit=0.0, set_limit=0.0)
+    off, rng = np.array([found.distance(each) for each in second]), np.random.default_rng(0)
+    sets = [found.set_distance(second[rng.integers(len(second), size=regions.SET_FRAMES)]) for _ in range(SETS)]
+    limit = quantile(off, np.arange(len(off)), regions.LEVELS[1])
+    return found.model_copy(update={"limit": limit, "set_limit": float(np.quantile(sets, regions.LEVELS[1]))})
 
 
 # The whole ------------------------------------------------------------------------------------------------------------
