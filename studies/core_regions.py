@@ -16,7 +16,6 @@ answers stay in FOLDER, and a stopped study goes on. Printed are
 """
 
 import argparse
-import copy
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,9 +26,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measuring import print_markdown
-from simtest.advice import core_calibration, plan
+from simtest.advice import core_calibration
 from simtest.advice.core_calibration import batch_experiment, interval_scores, kept_frame, quantile, shift_of, strata_of
-from simtest.advice.plan import Question
+from simtest.advice.plan import DISTANCES, Question
 from simtest.advice.scope import read_scope
 from simtest.dataset.scoring.frames import CaseFrames, RenderedFrame
 from simtest.estimators import load_estimators
@@ -46,8 +45,8 @@ CORES = (*OWN, "learned_spot", "command: python examples/cores/python/core.py")
 SEEDS = {"calibration": 1, "fresh": 2}
 SHIFTED = ("other organ", "steeper relief", "light moved", "coarser coding")
 MOVED_MM, QUALITY = 1.0, 40
-STEEPER = 1.55
-"""Twice would be a relief that is not allowed to the recipe's longest wavelengths."""
+STEEPER, GROOVES = 1.5, "surface.relief.bands.1.slope_deg"
+"""Twice would be a relief that is not allowed to the recipe's longest wavelengths; most of the slope is theirs."""
 ROUND = 1.7308
 """The 95 % quantile of the length of a round normal pair over the root of its covariance's trace."""
 
@@ -78,32 +77,19 @@ class Work:
 
     def changed(self, question: Question) -> Experiment:
         """Return the experiment of the batch with its shift."""
-        around = plan.surroundings(question)
-        if self.kind == "steeper relief":
-            steeper = copy.deepcopy(around)
-            for n, band in enumerate(steeper.set["surface"]["relief"]["bands"]):
-                key = f"surface.relief.bands.{n}.slope_deg"
-                if key in steeper.random:
-                    low, high = steeper.random[key]
-                    steeper.random[key] = STEEPER * low, STEEPER * high
-                else:
-                    band["slope_deg"] = STEEPER * band["slope_deg"]
-            plan.surroundings, kept = (lambda question: steeper), plan.surroundings
-            try:
-                return batch_experiment(question, self.number)
-            finally:
-                plan.surroundings = kept
         experiment = batch_experiment(question, self.number)
         (group,) = experiment.groups
-        held = dict(group.set)
+        held, pool = dict(group.set), dict(group.pool[0])
+        if self.kind == "steeper relief":
+            pool[GROOVES] = tuple(STEEPER * each for each in pool[GROOVES])
         if self.kind == "coarser coding":
-            held["sensor"] = {**held["sensor"], "coding": {"type": "jpeg", "quality": QUALITY, "chroma": "4:2:0"}}
+            pool["sensor.coding.quality"] = (QUALITY,) * DISTANCES
         if self.kind == "light moved":
             lights, each = question.scope._file.rig.nominal_mm().tolist(), held["rig"].get("each", {})
             held["rig"] = {"lights": [
                 {"position_mm": [x + MOVED_MM, y, z], "power": 1 / len(lights), **each} for x, y, z in lights
             ]}  # fmt: skip
-        return experiment.model_copy(update={"groups": (group.model_copy(update={"set": held}),)})
+        return experiment.model_copy(update={"groups": (group.model_copy(update={"set": held, "pool": (pool,)}),)})
 
 
 def told_wrongly(frame: RenderedFrame) -> RenderedFrame:

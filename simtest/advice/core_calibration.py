@@ -32,8 +32,9 @@ from simtest.runtime import provenance
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import JsonObject, make_folder, read_json, write_json
 from simtest.runtime.processes import Engine, OnStep, make_engine
-from simtest.runtime.seeds import Stage, integer
+from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import Experiment
+from simtest.spec.recipes import load_dataset
 from simtest.validation.cases import expand
 from simtest.validation.realisation import answer, score
 from simtest.validation.runner import Progress, variant_of
@@ -47,7 +48,10 @@ LEAST_HIGHLIGHTS, LEAST_FRAMES = 100, 50
 ORDER: tuple[Feature, ...] = ("sigma_deg", "score", "flags", "radius_px", "border", "axis_ratio", "kind")
 """In which strata are parted."""
 
-FOLDS, RIDGE, SHRINKAGE = 10, 0.05, 0.1
+RECIPE = "endoscopy"
+"""Dataset recipe whose ranges reach over real frames."""
+
+FOLDS, SETS, RIDGE, SHRINKAGE = 10, 1000, 0.05, 0.3
 """The last two of the expected error's weights and of the frames' statistics, over a variance of 1."""
 
 # Answers to frames ----------------------------------------------------------------------------------------------------
@@ -197,7 +201,8 @@ def _parted(
 def shift_of(statistics: Array) -> Shift:
     """Find how far off frames of the calibration are, by their statistics, shape (frames, S), NaN where not told.
 
-    The centre and covariance are those of one half of the frames, the limit is the conformal quantile of the other's.
+    The centre and covariance are those of one half of the frames, the limit is the conformal quantile of the other's;
+    of several frames together that of sets drawn from these.
     """
     first, second = statistics[::2], statistics[1::2]
     told = np.isfinite(first)
@@ -207,9 +212,11 @@ def shift_of(statistics: Array) -> Shift:
     scaled = off / spread
     values, vectors = np.linalg.eigh((1 - SHRINKAGE) * np.cov(scaled.T) + SHRINKAGE * np.eye(len(centre)))
     whitening = (vectors / np.sqrt(values)).T / spread
-    found = Shift(centre=tuple(centre), whitening=tuple(map(tuple, whitening)), limit=0.0)
-    off = np.array([found.distance(each) for each in second])
-    return found.model_copy(update={"limit": quantile(off, np.arange(len(off)), regions.LEVELS[1])})
+    found = Shift(centre=tuple(centre), whitening=tuple(map(tuple, whitening)), limit=0.0, set_limit=0.0)
+    off, rng = np.array([found.distance(each) for each in second]), np.random.default_rng(0)
+    sets = [found.set_distance(second[rng.integers(len(second), size=regions.SET_FRAMES)]) for _ in range(SETS)]
+    limit = quantile(off, np.arange(len(off)), regions.LEVELS[1])
+    return found.model_copy(update={"limit": limit, "set_limit": float(np.quantile(sets, regions.LEVELS[1]))})
 
 
 # The whole ------------------------------------------------------------------------------------------------------------
@@ -276,12 +283,32 @@ def calibrate_core(
 
 
 def batch_experiment(question: Question, number: int) -> Experiment:
-    """Return the frames of a batch: those of an advice, one at each distance, in the organ's own colours."""
+    """Return the frames of a batch: those of an advice, one at each distance, and what is not known as `RECIPE` has it.
+
+    That is the organ's colours, vessels, film and relief, and what the scope leaves to its sensor's preset.
+    """
     seed = integer(question.seed, "calibrate core", "batch", number, Stage.SWEEP)
     experiment = main_experiment(replace(question, frames=DISTANCES, seed=seed))
-    (group,) = experiment.groups
-    held = {key: value for key, value in group.set.items() if key != "reflectance.albedo"}
-    return experiment.model_copy(update={"groups": (group.model_copy(update={"set": held}),)})
+    (group,), families = experiment.groups, load_dataset(RECIPE).families
+    held, pool = dict(group.set), dict(group.pool[0])
+    # An advice's walls have no vessels.
+    del held["reflectance.albedo"]
+    kinds = ["reflectance.albedo."]
+    if "relief" in held["surface"]:
+        kinds += ["reflectance.film."] + ["surface.relief.bands."] * (question.scope.relief is None)
+    tissue = next(each for each in families if each.scene == group.scene)
+    chain = next((each for each in families if each.set["sensor"]["preset"] == held["sensor"].get("preset")), None)
+    known = {f"sensor.{key}" for key in question.scope.tables.get("sensor", {})} | {"sensor.overlay"}
+    rng = generator(seed, "calibrate core", "unknown", 0, Stage.SWEEP)
+    for family, own in ((tissue, tuple(kinds)), (chain, ("sensor.",))):
+        if family is not None:
+            held |= {key: value for key, value in family.set.items() if key.startswith(own)}
+            for key, drawn in {**family.per_anatomy, **family.per_sample}.items():
+                if key.startswith(own) and ".".join(key.split(".")[:2]) not in known:
+                    pool[key] = tuple(drawn.draw(rng) for _ in range(DISTANCES))
+    if chain is not None:
+        held["sensor"] = {**chain.set["sensor"], **held["sensor"]}
+    return experiment.model_copy(update={"groups": (group.model_copy(update={"set": held, "pool": (pool,)}),)})
 
 
 def _tell(progress: Progress | None, done: Iterator[int], total: int) -> None:

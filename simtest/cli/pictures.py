@@ -363,6 +363,31 @@ def core_(
 
 @calibrate.command
 @command
+def check(calibration: Path, pictures: list[Path], /) -> Told:
+    """Tell whether pictures are like the frames of a core's calibration, each and all together.
+
+    Exit 1 if together they are not: its regions do not hold for them.
+
+    Parameters
+    ----------
+    calibration : Path
+        File of calibrate core.
+    pictures : list of Path
+        Pictures, or folders of pictures: 16 or more separate views.
+    """
+    from simtest.reconstruction.light_calibration.run import picture_readers
+    from simtest.reconstruction.regions import check_frames, read_calibrations
+
+    (own,) = read_calibrations([str(calibration)]).values()
+    made = check_frames(own, picture_readers(pictures))
+    how = f"{made['distance']:.3g} standard deviations off, of which {made['limit']:.3g} may be chance"
+    alone = few([f"unlike by itself: {name}" for name in made["unlike_alone"]])
+    head = f"{made['frames']} frames together are {'un' * made['unlike']}like those of {own.scope}: {how}"
+    return Told([], made, [head, *alone], 1 if made["unlike"] else 0)
+
+
+@calibrate.command
+@command
 def light(
     pictures: list[Path],
     /,

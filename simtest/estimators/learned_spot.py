@@ -28,6 +28,7 @@ from simtest.estimators.learned import (
 from simtest.estimators.protocol import Estimate, Target
 from simtest.geometry import Array
 from simtest.runtime.arrays import Image
+from simtest.runtime.fitted import fitted_number
 
 SIDE = 32  # side of a crop, px of the crop
 STEPS = (1, 3, 9)  # pixels of the frame for one of each crop: the highlight, its neighbours, the shading around
@@ -107,6 +108,8 @@ def _clipped_near(frame: Frame, peak: Array) -> int:
     return int(frame.clipped[max(y - half, 0) : y + half, max(x - half, 0) : x + half].sum())
 
 
+CUT_PX, CUT_FACTOR = fitted_number("cut_spot.px"), fitted_number("cut_spot.factor")
+
 FORMAT = "simtest spot_normals, version 3"
 
 _CHECKED = tuple(EXTRAS[:1]) + tuple(EXTRAS[3:9])
@@ -171,6 +174,9 @@ class LearnedSpot(LearnedNormals):
         made = outputs[:, SURFACES.index(self.target)]
         scales, ratio_scales = self._network.scales[self.target], self._network.ratio_scales[self.target]
         factors = scales.at(log_deviation(made)) * inflated
+        # A spot that the border cuts shows the network half of what it was taught.
+        size = frame.camera.width, frame.camera.height
+        factors = factors * np.where(np.minimum(peaks, size - peaks).min(axis=1) < CUT_PX, CUT_FACTOR**2, 1.0)
         normals, covariances = stated_normals(frame.camera.unproject(peaks), made, ROTATION_SCALE, factors)
         sure = np.clip(made[:, RATIO_DEVIATION], *LOG_RANGE)
         deviations = np.exp(sure) * np.sqrt(ratio_scales.at(sure) * inflated)

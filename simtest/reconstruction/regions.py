@@ -7,11 +7,11 @@ those of the calibration, by the statistics that realism is measured by, get the
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, JsonValue
@@ -33,9 +33,12 @@ if TYPE_CHECKING:
     from simtest.reconstruction.records import Specularity
 
 LEVELS = (0.68, 0.95)
+SET_FRAMES, LEAST_SET, MOST_OFF = 32, 16, 3.0
+"""Frames that are judged together, and the fewest; no frame counts as farther off along a direction."""
+
 MOST_DEG, REGRESSORS = 180.0, 11
 
-Format = Literal["simtest core calibration, version 1"]
+Format = Literal["simtest core calibration, version 2"]
 Feature = Literal["sigma_deg", "axis_ratio", "score", "radius_px", "border", "flags", "kind"]
 Ends = dict[Feature, tuple[float | None, float | None]]
 """What features are at least, and below."""
@@ -145,22 +148,31 @@ def scales(seen: Seen, expected: Expected) -> dict[ScaleKind, Array]:
 
 
 class Shift(Spec):
-    """Where the frames' statistics lie, what takes them to unit covariance, and how far off at most 5 % are."""
+    """Where the frames' statistics lie, what takes them to unit covariance, and how far off 95 % are at most."""
 
     centre: Statistics
     whitening: Annotated[tuple[Statistics, ...], Field(min_length=len(NAMES), max_length=len(NAMES))]
     limit: Positive
+    set_limit: Positive = Field(description="the same of `SET_FRAMES` frames together")
+
+    def off(self, statistics: Array) -> Array:
+        """Return how far off frames are, shape (..., S), in standard deviations; what one does not tell is 0."""
+        return np.nan_to_num(statistics - np.array(self.centre), nan=0.0) @ np.array(self.whitening).T
 
     def distance(self, statistics: Array) -> float:
-        """Return how far off a frame is, in standard deviations; what it does not tell counts as the centre."""
-        off = np.nan_to_num(statistics - np.array(self.centre), nan=0.0)
-        return float(np.linalg.norm(np.array(self.whitening) @ off))
+        """Return how far off a frame is, in standard deviations."""
+        return float(np.linalg.norm(self.off(statistics)))
+
+    def set_distance(self, statistics: Array) -> float:
+        """Return how far off the mean of frames is, shape (F, S), in standard deviations of it."""
+        mean = np.clip(self.off(statistics), -MOST_OFF, MOST_OFF).mean(axis=0)
+        return float(math.sqrt(len(statistics)) * np.linalg.norm(mean))
 
 
 class CoreCalibration(Spec):
     """What was found of a core on frames of a scope."""
 
-    format: Format = "simtest core calibration, version 1"
+    format: Format = "simtest core calibration, version 2"
     core: str = Field(min_length=1, description="its name in results")
     scope: str
     size: tuple[int, int] = Field(description="of the frames, px")
@@ -200,6 +212,27 @@ def read_calibrations(files: Sequence[str]) -> dict[str, CoreCalibration]:
     if len(made) < len(paths):
         raise InputError(f"{', '.join(files)}: several files of one core; one must be given")
     return made
+
+
+def check_frames(own: CoreCalibration, pictures: Sequence[tuple[str, Callable[[], Image]]]) -> dict[str, Any]:
+    """Return whether frames are like those of a calibration, one by one and all together; raise `InputError` if few.
+
+    Each is its name and what reads it. Of many, `SET_FRAMES` that are evenly spaced are judged together.
+    """
+    if own.shift is None:
+        raise InputError(f"the calibration of {own.core} is of grey frames, of which none is unlike another")
+    told = {name: statistics for name, read in pictures if (statistics := statistics_of(read())) is not None}
+    if len(told) < LEAST_SET:
+        raise InputError(f"{len(told)} frames in colour of {LEAST_SIDE} px and more; at least {LEAST_SET} are needed")
+    values = np.array([*told.values()])
+    off = own.shift.set_distance(
+        values[np.linspace(0, len(values) - 1, min(len(values), SET_FRAMES)).round().astype(int)]
+    )
+    alone = [name for name, each in told.items() if own.shift.distance(each) > own.shift.limit]
+    return {
+        "frames": len(told), "unlike": off > own.shift.set_limit, "distance": off, "limit": own.shift.set_limit,
+        "unlike_alone": alone,
+    }  # fmt: skip
 
 
 # What a frame's answers get -------------------------------------------------------------------------------------------

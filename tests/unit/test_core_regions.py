@@ -28,9 +28,17 @@ from simtest.cli.common import RegionOptions
 from simtest.dataset.scoring.frames import CaseFrames, Source, frames_of_cases
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
+from simtest.reconstruction.light_calibration.run import picture_readers
 from simtest.reconstruction.options import Options
 from simtest.reconstruction.outputs import REGION_COLUMNS, columns_of
-from simtest.reconstruction.regions import CoreCalibration, read_calibrations
+from simtest.reconstruction.regions import (
+    LEAST_SET,
+    SET_FRAMES,
+    CoreCalibration,
+    check_frames,
+    read_calibrations,
+    statistics_of,
+)
 from simtest.reconstruction.sequence import _settings
 from simtest.reconstruction.statistics import NAMES
 from simtest.spec import Experiment
@@ -137,6 +145,23 @@ def test_the_check_on_shift_finds_shifted_frames_and_few_others():
     assert np.mean([found.distance(each + 6 * mixing[0]) > found.limit for each in fresh]) > 0.8
 
 
+def test_many_frames_together_show_a_shift_that_one_hides():
+    rng = np.random.default_rng(4)
+    mixing = rng.standard_normal((len(NAMES), len(NAMES)))
+    found = shift_of(rng.standard_normal((128, len(NAMES))) @ mixing)
+
+    def unlike(shift, count=SET_FRAMES):
+        sets = (rng.standard_normal((count, len(NAMES))) @ mixing + shift * mixing[0] for _ in range(200))
+        told = [(found.set_distance(each) > found.set_limit, found.distance(each[0]) > found.limit) for each in sets]
+        return np.mean(told, axis=0)
+
+    assert unlike(0.0)[0] <= 0.05
+    assert unlike(0.0, LEAST_SET)[0] <= 0.05
+    together, alone = unlike(1.5)
+    assert together > 0.9
+    assert alone < 0.3
+
+
 # Its file and what answers get ----------------------------------------------------------------------------------------
 
 
@@ -198,7 +223,10 @@ def test_too_wide_regions_are_refused(tmp_path):
         ({"size": [320, 240]}, "160 x 120 px, not 320 x 240"),
         ({"detector": "colour"}, "isolated highlights by peaks"),
         ({"every": True}, "isolated highlights by peaks"),
-        ({"shift": {"centre": [0.0] * 19, "whitening": np.eye(19).tolist(), "limit": 1.0}}, "inf standard deviations"),
+        (
+            {"shift": {"centre": [0.0] * 19, "whitening": np.eye(19).tolist(), "limit": 1.0, "set_limit": 1.0}},
+            "inf standard deviations",
+        ),
     ],
 )
 def test_other_frames_than_the_calibrations_are_told(tmp_path, change, why):
@@ -218,7 +246,7 @@ def test_other_frames_than_the_calibrations_are_told(tmp_path, change, why):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"format": "simtest core calibration, version 2"}, "format"),
+        ({"format": "simtest core calibration, version 1"}, "format"),
         ({"highlights": "many"}, "highlights = 'many'"),
         ({"strata": {}}, "strata"),
         ({"strata": {"middle": {}}}, "strata"),
@@ -354,6 +382,34 @@ def test_batches_differ_and_show_the_organs_colours():
     assert first.groups[0].pool != second.groups[0].pool
     # An advice's walls have no vessels.
     assert "reflectance.albedo" not in first.groups[0].set
+    (pool,) = first.groups[0].pool
+    for key in ("reflectance.albedo.base.1", "reflectance.film.level", "surface.relief.bands.1.slope_deg",
+                "sensor.coding.quality"):  # fmt: skip
+        assert len({*pool[key]}) > 2, key
+
+
+def test_what_a_scope_states_is_not_drawn(tmp_path):
+    text = "[camera]\nwidth = 64\nheight = 64\nfx = 40.0\nfy = 40.0\n"
+    for sensor, held, drawn in (
+        ("[sensor]\npreset = 'colonoscope_hd'\ncoding = {type = 'jpeg', quality = 60, chroma = '4:2:0'}\n", 60, True),
+        (
+            "[sensor]\nfull_well = 9000.0\nbits = 8\ncoding = {type = 'jpeg', quality = 60, chroma = '4:2:0'}\n",
+            60,
+            False,
+        ),
+        ("", None, True),
+    ):
+        (tmp_path / "scope.toml").write_text(text + sensor + "[relief]\nslope_deg = [2.0, 4.0]\n")
+        (group,) = batch_experiment(Question(read_scope(str(tmp_path / "scope.toml"))), 0).groups
+        (pool,) = group.pool
+        assert ("sensor.sharpening.amount" in pool) == drawn
+        assert ("sensor.coding.quality" in pool) == (held is None)
+        assert held is None or group.set["sensor"]["coding"]["quality"] == held
+        assert not [key for key in pool if key.startswith("surface.relief.bands.1")]
+        expand(batch_experiment(Question(read_scope(str(tmp_path / "scope.toml"))), 0))
+    # A smooth phantom has neither relief nor a film's level.
+    (group,) = batch_experiment(Question(read_scope("laparoscope"), "plane"), 0).groups
+    assert not [key for key in group.pool[0] if key.startswith(("surface.relief", "reflectance.film.level"))]
 
 
 @pytest.mark.slow
@@ -402,6 +458,36 @@ def test_the_command_line_takes_calibrations(tmp_path, monkeypatch, capsys):
     assert "95 % within" in capsys.readouterr().out
     assert "region_source" in (tmp_path / "out" / "index.html").read_text()
     assert "radius_95_deg" in (tmp_path / "out" / "normals.csv").read_text().splitlines()[0]
+
+
+def test_a_folder_of_frames_is_checked(tmp_path, capsys, monkeypatch):
+    rng, frames = np.random.default_rng(2), tmp_path / "frames"
+    frames.mkdir()
+    tints = rng.uniform(0.4, 0.6, (LEAST_SET, 3))
+    pictures = [np.clip(each * rng.uniform(0.8, 1.0, (96, 96, 1)), 0, 1) for each in tints]
+    for number, each in enumerate(pictures):
+        cv2.imwrite(str(frames / f"{number:02d}.png"), np.round(255 * each).astype(np.uint8))
+    centre = np.nan_to_num([statistics_of(each[..., ::-1]) for each in pictures]).mean(axis=0).tolist()
+    shift = {"centre": centre, "whitening": (0.01 * np.eye(len(NAMES))).tolist(), "limit": 5.0, "set_limit": 5.0}
+
+    def told(**changes):
+        path = calibration(tmp_path, shift=shift | changes)
+        code = APP(["calibrate", "check", str(path), str(frames)], exit_on_error=False, result_action="return_value")
+        return code, capsys.readouterr().out
+
+    assert told() == (0, told()[1])
+    assert "16 frames together are like those of colocated" in told()[1]
+    code, text = told(centre=[each + 300 for each in centre], limit=5.0)
+    assert code == 1
+    assert "together are unlike" in text
+    assert "unlike by itself: 00.png" in text
+    (frames / "00.png").unlink()
+    with pytest.raises(InputError, match="15 frames in colour"):
+        check_frames(
+            read_calibrations([str(calibration(tmp_path, shift=shift))])["cone_axis"], picture_readers([frames])
+        )
+    with pytest.raises(InputError, match="grey frames"):
+        check_frames(read_calibrations([str(calibration(tmp_path))])["cone_axis"], [])
 
 
 def test_options_of_regions_need_a_file(tmp_path):

@@ -7,6 +7,7 @@ from simtest.calibration import Calibration, Frame, Priors
 from simtest.estimators import learned
 from simtest.estimators.learned import (
     RELIEF_RAD,
+    CovarianceScale,
     image_basis,
     median_of_lit,
     normal_of,
@@ -15,7 +16,7 @@ from simtest.estimators.learned import (
     turned_normals,
 )
 from simtest.estimators.learned_dense import interpolated
-from simtest.estimators.learned_spot import EXTRAS, SIDE, STEPS, spot_inputs
+from simtest.estimators.learned_spot import CUT_FACTOR, CUT_PX, EXTRAS, OUTPUTS, SIDE, STEPS, LearnedSpot, spot_inputs
 from simtest.geometry import Camera
 from simtest.geometry.vectors import tangent_basis, tangent_coordinates
 
@@ -49,6 +50,26 @@ def test_crops_show_the_frame_around_the_peak(picture):
     # The widest crop reaches over the border, where it is dark.
     assert crops[0, 2, 0, 0] == pytest.approx(np.log(0.02))
     assert np.isfinite(crops).all()
+
+
+class Stub:
+    """A network that is as sure of all highlights."""
+
+    def __init__(self):
+        self.scales = self.ratio_scales = {"base": CovarianceScale((0.0,), (1.0,))}
+
+    def run(self, crops, extras):
+        """Return the middle of the range for each crop."""
+        return np.zeros((len(crops), 2, len(OUTPUTS))), np.ones(len(crops)), [None] * len(crops)
+
+
+def test_a_network_is_less_sure_of_spots_that_the_border_cuts(picture):
+    core = LearnedSpot()
+    vars(core)["_network"] = Stub()
+    sides = [[40.0, CUT_PX - 1], [40.0, WIDTH - CUT_PX + 1], [CUT_PX - 1, 40.0], [WIDTH - CUT_PX + 1, 40.0]]
+    cut = core._at(frame(picture), np.array(sides))
+    (whole,) = core._at(frame(picture), np.array([[40.0, CUT_PX + 1]]))
+    assert [each.deviation_deg / whole.deviation_deg for each in cut] == pytest.approx([CUT_FACTOR] * 4, rel=1e-6)
 
 
 def test_a_dark_background_does_not_set_the_scale_of_the_light(picture):
