@@ -110,7 +110,7 @@ def progress_bar(
 
     `afterwards` is what the body does once all steps are done, unless the last step is that of a page (`WRITTEN`):
     nothing follows it. A single step shows no bar, unless it is long. What comes after all steps of a bar, such as the
-    steps of a page, has a bar of its own below. `stopped` is what a stop leaves; default what `main` says of the command.
+    steps of a page, has a bar of its own below. `stopped` is what a stop leaves; default what `main` says.
     """
     display: _Lines | _Bar | None = None
     began, lock = time.monotonic(), threading.Lock()
