@@ -17,8 +17,8 @@ from simtest.runtime.stops import STOP
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-LEAST_STEPS = 2
-"""Measured steps before which there is no estimate: with the first one, three."""
+LEAST_STEPS, JUDGED_STEPS = 2, 4
+"""Measured steps before which there is no estimate, with the first one three, and none that must be stable."""
 
 LEAST_S = 2.0
 """Measured time before which there is none; at a terminal, work that has no steps shows a bar after it."""
@@ -52,7 +52,7 @@ class Remaining:
         return None if pace is None else pace * (total - done)
 
     def _pace(self) -> float | None:
-        """Return the time of a step, s, as measured over the later half of the steps; None while it is not stable."""
+        """Return the time of a step, s, over all of a few steps, else over the later half; None while it is not stable."""
         if not self._ends:
             return None
         (start, began), (end, ended) = self._ends[0], self._ends[-1]
@@ -60,6 +60,8 @@ class Remaining:
             return None
         middle, passed = next(entry for entry in reversed(self._ends) if 2 * entry[0] <= start + end)
         overall, recent = (ended - began) / (end - start), (ended - passed) / (end - middle)
+        if end - start < JUDGED_STEPS:
+            return overall
         return recent if overall <= AGREEMENT * recent and recent <= AGREEMENT * overall else None
 
 
