@@ -49,7 +49,7 @@ def environment() -> "Environment":
     folder = cache_folder()
     made = Environment(
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, bytecode_cache=folder and Compiled(str(folder)),
+        trim_blocks=True, lstrip_blocks=True, bytecode_cache=Compiled(str(folder)) if folder else None,
     )  # fmt: skip
     made.filters |= {
         "degrees": style.degrees,

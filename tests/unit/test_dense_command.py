@@ -167,7 +167,7 @@ def test_names_of_maps_are_checked_before_anything_is_rendered(run, here, maps, 
     def render(*_):
         raise AssertionError("rendered")
 
-    monkeypatch.setattr(score, "scored_frames", render)
+    monkeypatch.setattr(score, "frames_of", render)
     np.save(maps / "stranger.npy", np.zeros((4, 4, 3)))
     code, _, errors = here("score", maps, "--on", run[0], "--out", tmp_path / "scored")
     assert code != 0
@@ -178,7 +178,7 @@ def test_a_stopped_score_does_not_say_that_it_goes_on(run, here, maps, tmp_path,
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(score, "scored_frames", stop)
+    monkeypatch.setattr(score, "frames_of", stop)
     np.save(maps / f"{run[1][0].name}.npy", np.zeros((4, 4, 3)))
     code, _, errors = here("score", maps, "--on", run[0], "--out", tmp_path / "scored")
     assert code == 130
