@@ -499,9 +499,9 @@ def test_each_row_of_a_timeline_has_its_region(tmp_path):
         cv2.imwrite(str(frames / f"{number}.png"), np.round(255 * lobes()).astype(np.uint8))
     own = CoreRegions(files=(str(calibration(tmp_path)),))
     options = Options(fov_deg=60.0, detector="peaks", estimators=("cone_axis", "curved"), regions=own)
-    for name, given in (("told", options), ("plain", replace(options, regions=None))):
+    for name, chosen in (("told", options), ("plain", replace(options, regions=None))):
         with pytest.warns(UserWarning, match="no calibration"):
-            reconstruct_sequence(frames, tmp_path / name, given)
+            reconstruct_sequence(frames, tmp_path / name, chosen)
     told, plain = (pl.read_csv(tmp_path / name / "timeline.csv") for name in ("told", "plain"))
     assert told.drop(REGION_COLUMNS).equals(plain)
     assert told.filter(pl.col("estimator") == "cone_axis")["radius_95_deg"].null_count() == 0
