@@ -10,7 +10,8 @@ answers stay in FOLDER, and a stopped study goes on. Printed are
 1. the coverage of the regions of 68 and 95 %, with the frame as the unit; the strata whose coverage is below 90 %
    beyond chance (Holm, 1 %); the mean interval score over that of one radius for all answers, and over that of errors
    over the reported deviation;
-2. the share of shifted frames that the check on shift finds, and the coverage there without and with it;
+2. the share of shifted frames, and of sets of them, that the check on shift finds, and the coverage there without and
+   with it;
 3. for estimators that report a covariance, the factor between the deviation that the errors show and the reported one:
    the 95 % quantile of the error over the reported deviation, over what that is for a round covariance, 1.73.
 """
@@ -32,7 +33,7 @@ from simtest.advice.plan import DISTANCES, Question
 from simtest.advice.scope import read_scope
 from simtest.dataset.scoring.frames import CaseFrames, RenderedFrame
 from simtest.estimators import load_estimators
-from simtest.reconstruction.regions import Strata, Stratum
+from simtest.reconstruction.regions import LEAST_SET, SET_FRAMES, Shift, Strata, Stratum
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import write_json
 from simtest.runtime.processes import OnStep, make_engine
@@ -45,6 +46,7 @@ CORES = (*OWN, "learned_spot", "command: python examples/cores/python/core.py")
 SEEDS = {"calibration": 1, "fresh": 2}
 SHIFTED = ("other organ", "steeper relief", "light moved", "coarser coding")
 MOVED_MM, QUALITY = 1.0, 40
+SETS = (LEAST_SET, SET_FRAMES)
 STEEPER, GROOVES = 1.5, "surface.relief.bands.1.slope_deg"
 """Twice would be a relief that is not allowed to the recipe's longest wavelengths; most of the slope is theirs."""
 ROUND = 1.7308
@@ -209,10 +211,20 @@ def print_study(frames: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
              "median radius (deg)", "score / one radius", "error / deviation alone")  # fmt: skip
     print_markdown([heads, *first])
     print(holm(chances))
-    found = [(kind, str(len(own)), f"{100 * own.mean():.0f}") for kind, own in away.items() if kind != "calibration"]
-    print_markdown([("frames", "in all", "found by the check (%)"), *found])
+    found = [(kind, str(len(own)), f"{100 * own.mean():.0f}", *(together(shift, frames[kind], n) for n in SETS))
+             for kind, own in away.items() if kind != "calibration"]  # fmt: skip
+    print_markdown([("frames", "in all", "found by the check (%)", *(f"{n} together (%)" for n in SETS)), *found])
     print_markdown([("core", "normal", "shift", "answers", "95 % without the check", "with it"), *shifted])
     print_markdown([("core", "normal", "stratum", "answers", "factor"), *factors])
+
+
+def together(shift: Shift, frames: Sequence[Mapping[str, Any]], count: int) -> str:
+    """Return which share of sets of so many frames is found to be unlike the calibration's, %."""
+    values, rng = np.array([frame["statistics"] for frame in frames], float), np.random.default_rng(0)
+    if len(values) < count:
+        return "–"
+    sets = [values[rng.permutation(len(values))[:count]] for _ in range(500)]
+    return f"{100 * np.mean([shift.set_distance(each) > shift.set_limit for each in sets]):.0f}"
 
 
 def quantile_ratio(held: Mapping[str, Array], part: Stratum) -> float:

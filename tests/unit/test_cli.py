@@ -596,7 +596,7 @@ def test_json_holds_neither_nan_nor_paths_that_break_it(capsys):
 
 def test_reports_are_json_on_request():
     """Each command that reports takes --json: whoever adds one is reminded."""
-    reports = {"calibrate light", "core check", "score", "advise", "twin",
+    reports = {"calibrate check", "calibrate light", "core check", "score", "advise", "twin",
                "doctor", "list", "render", "views", "view", "export", "reconstruct", "realism", "fit", "validate",
                "nightly", "nightly accept", "dataset", "dataset verify", "dataset sample", "dataset preview",
                "dataset export", "mesh check", "mesh colon", "mesh liver", "bench run", "bench table",

@@ -23,6 +23,7 @@ from simtest.advice.core_calibration import (
 )
 from simtest.advice.plan import Question
 from simtest.advice.scope import read_scope
+from simtest.bench.run import run_bench
 from simtest.cli.commands import APP
 from simtest.cli.common import RegionOptions
 from simtest.dataset.scoring.frames import CaseFrames, Source, frames_of_cases
@@ -39,11 +40,12 @@ from simtest.reconstruction.regions import (
     read_calibrations,
     statistics_of,
 )
-from simtest.reconstruction.sequence import _settings
+from simtest.reconstruction.sequence import _settings, reconstruct_sequence
 from simtest.reconstruction.statistics import NAMES
 from simtest.spec import Experiment
 from simtest.spec.recipes import CoreRegions
 from simtest.validation.cases import expand
+from tests.bench_tiny import tiny_suite
 
 # What is found --------------------------------------------------------------------------------------------------------
 
@@ -415,7 +417,7 @@ def test_what_a_scope_states_is_not_drawn(tmp_path):
 @pytest.mark.slow
 def test_a_stopped_calibration_goes_on_to_the_same_file(tmp_path, monkeypatch):
     monkeypatch.setattr(core_calibration, "LEAST_BATCHES", 5)
-    monkeypatch.setattr(core_calibration, "LEAST_FRAMES", 19)
+    monkeypatch.setattr(core_calibration, "FEWEST_FRAMES", 19)
     text = "[camera]\nwidth = 64\nheight = 64\nfx = 40.0\nfy = 40.0\n[sensor]\npreset = 'colonoscope_hd'\n"
     (tmp_path / "scope.toml").write_text(text)
     question = Question(read_scope(str(tmp_path / "scope.toml")), "plane", seed=5)
@@ -488,6 +490,61 @@ def test_a_folder_of_frames_is_checked(tmp_path, capsys, monkeypatch):
         )
     with pytest.raises(InputError, match="grey frames"):
         check_frames(read_calibrations([str(calibration(tmp_path))])["cone_axis"], [])
+
+
+def test_each_row_of_a_timeline_has_its_region(tmp_path):
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for number in range(2):
+        cv2.imwrite(str(frames / f"{number}.png"), np.round(255 * lobes()).astype(np.uint8))
+    own = CoreRegions(files=(str(calibration(tmp_path)),))
+    options = Options(fov_deg=60.0, detector="peaks", estimators=("cone_axis", "curved"), regions=own)
+    for name, chosen in (("told", options), ("plain", replace(options, regions=None))):
+        with pytest.warns(UserWarning, match="no calibration"):
+            reconstruct_sequence(frames, tmp_path / name, chosen)
+    told, plain = (pl.read_csv(tmp_path / name / "timeline.csv") for name in ("told", "plain"))
+    assert told.drop(REGION_COLUMNS).equals(plain)
+    assert told.filter(pl.col("estimator") == "cone_axis")["radius_95_deg"].null_count() == 0
+    assert told.filter(pl.col("estimator") != "cone_axis")["region_source"].null_count() == told.height / 2
+
+
+def test_scored_answers_have_their_regions(tmp_path, monkeypatch):
+    """A run's own answers, scored with a calibration, are those of the run with it."""
+    monkeypatch.chdir(tmp_path)
+    experiment = Experiment.model_validate(
+        {"name": "scored", "realisations": 2, "seed": 3, "estimators": ["cone_axis"],
+         "groups": [{"scene": "cylinder", "set": SMALL}]}
+    )  # fmt: skip
+    own = CoreRegions(files=(str(calibration(tmp_path)),))
+    run = simtest.validate(experiment, tmp_path / "run", export=tmp_path / "frames")
+    direct = simtest.validate(experiment.model_copy(update={"regions": own}), tmp_path / "direct").results
+    uses = pl.DataFrame(json.loads((tmp_path / "run" / "export.json").read_text())["uses"])
+    rows = run.results.filter(pl.col("specularity").is_not_null())
+    rows = rows.join(uses.select("frame", "setting", "realisation"), on=["setting", "realisation"])
+    told = ("frame", "estimator", "specularity", "x_px", "y_px", "normal_x", "normal_y", "normal_z", "cov_11", "cov_12",
+            "cov_22", "target", "axis_ratio", "flags", "status")  # fmt: skip
+    rows.rename({"look_x_px": "x_px", "look_y_px": "y_px"}).select(told).write_csv("answers.csv")
+    words = "score answers.csv --on run --out scored --regions calibration.json"
+    APP(words.split(), exit_on_error=False, result_action="return_value")
+    scored = pl.read_parquet("scored/results.parquet")
+    assert scored["radius_95_deg"].to_list() == pytest.approx(direct["radius_95_deg"].to_list(), abs=1e-9)
+    assert [*scored["region_source"]] == ["calibrated on 1200 highlights of colocated"] * 2
+    APP([*words.split(), "--refuse-above", "0.01"], exit_on_error=False, result_action="return_value")
+    assert {*pl.read_parquet("scored/results.parquet")["status"]} == {"refused"}
+
+
+def test_a_certificate_tells_its_calibration(tmp_path):
+    suite = tiny_suite(tmp_path / "v1")
+    calibrated = CoreRegions(files=(str(calibration(tmp_path)),))
+    plain = run_bench(suite, "cone_axis", tmp_path / "plain", parts=("smooth",))
+    made = run_bench(suite, "cone_axis", tmp_path / "made", parts=("smooth",), regions=calibrated)
+    assert "regions" not in plain.content["core"]
+    assert len(made.content["core"]["regions"]) == 64
+    refusing = calibrated.model_copy(update={"refuse_above_deg": 0.01})
+    refused = run_bench(suite, "cone_axis", tmp_path / "refused", parts=("smooth",), regions=refusing)
+    answered = [each.content["parts"]["smooth"]["answered"] for each in (plain, made, refused)]
+    assert answered == [6, 6, 0]
+    assert made.content["core"]["regions"] != refused.content["core"]["regions"]
 
 
 def test_options_of_regions_need_a_file(tmp_path):
