@@ -2,6 +2,7 @@
 
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,11 +17,11 @@ from simtest.runtime.stops import STOP
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-LEAST_STEPS = 4
-"""Measured steps before which there is no estimate."""
+LEAST_STEPS, JUDGED_STEPS = 2, 4
+"""Measured steps before which there is no estimate, with the first one three, and none that must be stable."""
 
 LEAST_S = 2.0
-"""Measured time before which there is none."""
+"""Measured time before which there is none; at a terminal, work that has no steps shows a bar after it."""
 
 AGREEMENT = 1.5
 """An estimate is stable where the paces of all measured steps and of their later half differ by at most this factor."""
@@ -51,7 +52,7 @@ class Remaining:
         return None if pace is None else pace * (total - done)
 
     def _pace(self) -> float | None:
-        """Return the time of a step, s, as measured over the later half of the steps; None while it is not stable."""
+        """Return the time of a step, s: over all of a few, else over the later half; None while it is not stable."""
         if not self._ends:
             return None
         (start, began), (end, ended) = self._ends[0], self._ends[-1]
@@ -59,11 +60,13 @@ class Remaining:
             return None
         middle, passed = next(entry for entry in reversed(self._ends) if 2 * entry[0] <= start + end)
         overall, recent = (ended - began) / (end - start), (ended - passed) / (end - middle)
+        if end - start < JUDGED_STEPS:
+            return overall
         return recent if overall <= AGREEMENT * recent and recent <= AGREEMENT * overall else None
 
 
 LINE_EVERY_S = 10.0
-"""Of a log; work that takes less leaves no line."""
+"""Of a log, after a line once the time left is known; work that takes less leaves none."""
 
 
 PATIENCE_S = 5.0
@@ -108,22 +111,35 @@ def progress_bar(
     """Show a bar, or lines, while the body runs, and yield the callable that moves it: (done, total, what).
 
     `afterwards` is what the body does once all steps are done, unless the last step is that of a page (`WRITTEN`):
-    nothing follows it. A single step shows no bar. What comes after all steps of a bar, such as the steps of a page,
-    has a bar of its own below. `stopped` is what a stop leaves; default what `main` says of the command.
+    nothing follows it. A single step shows no bar, unless it is long. What comes after all steps of a bar, such as the
+    steps of a page, has a bar of its own below. `stopped` is what a stop leaves; default what `main` says.
     """
     display: _Lines | _Bar | None = None
+    began, lock = time.monotonic(), threading.Lock()
+
+    def wait() -> None:
+        nonlocal display
+        with lock:
+            if display is None and not waiting.finished.is_set():
+                display = _Bar()
+
+    waiting = threading.Timer(LEAST_S, wait)
+    waiting.daemon = True
     with stop_between_steps() as check:
+        if at_terminal() and not MANNERS.quiet and not MANNERS.verbose:
+            waiting.start()
 
         def move(done: int, total: int, what: str) -> None:
             nonlocal display
             check()
             if MANNERS.quiet:
                 return
-            if display is None:
-                if done == total:
-                    return
-                # Not before the first step: bad input is reported in one line, and nothing to do takes no time.
-                display = _Lines() if MANNERS.verbose or not at_terminal() else _Bar()
+            with lock:
+                if display is None:
+                    if done == total:
+                        return
+                    # Not before the first step: bad input is reported in one line, and nothing to do takes no time.
+                    display = _Lines(began) if MANNERS.verbose or not at_terminal() else _Bar()
             display.show(done, total, afterwards if done == total and what != WRITTEN else what)
 
         try:
@@ -133,6 +149,8 @@ def progress_bar(
                 raise KeyboardInterrupt(stopped) from None
             raise
         finally:
+            with lock:
+                waiting.cancel()
             if isinstance(display, _Bar):
                 display.bar.stop()
 
@@ -143,17 +161,19 @@ def at_terminal() -> bool:
 
 
 class _Lines:
-    """Plain lines for a log: one in `LINE_EVERY_S`, or with --verbose one a step."""
+    """Plain lines for a log: one in `LINE_EVERY_S` and once the time left is known; with --verbose one a step."""
 
-    def __init__(self) -> None:
-        self.began = self.told = time.monotonic()
+    def __init__(self, began: float) -> None:
+        self.began = self.told = began
         self.remaining = Remaining()
+        self.is_known = False
 
     def show(self, done: int, total: int, what: str) -> None:
         """Print a line where the last one is old enough."""
         now = time.monotonic()
         left = self.remaining.seconds(done, total, now)
-        if not MANNERS.verbose and now - self.told < LINE_EVERY_S:
+        first, self.is_known = bool(left) and not self.is_known, self.is_known or bool(left)
+        if not (MANNERS.verbose or first) and now - self.told < LINE_EVERY_S:
             return
         self.told, passed = now, now - self.began
         about = f", about {left:.0f} s left" if left and done < total else ""

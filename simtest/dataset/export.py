@@ -16,10 +16,12 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from simtest.dataset.scoring.dense.truth import MOST_KEPT, keep_truth, kept_file, truth_of_view
 from simtest.dataset.scoring.frames import (
     ExportedFrame,
     Frames,
     Record,
+    RenderedFrame,
     ShownFrame,
     Source,
     Use,
@@ -35,12 +37,13 @@ from simtest.runtime.arrays import Image
 from simtest.runtime.files import are_nested, write_atomically, write_json
 from simtest.runtime.locks import LOCK, exclusive_folder
 from simtest.runtime.processes import Engine, OnStep
+from simtest.simulation.frame import brightest_mm
 from simtest.simulation.frame_files import encoded_png
 from simtest.simulation.sensor import displayed
 from simtest.spec import Experiment, calibration_toml, camera_table
 from simtest.spec.sensor import Sensor
 from simtest.validation.cases import expand
-from simtest.validation.run_folder import EXPORTING
+from simtest.validation.run_folder import EXPORTING, TRUTH, remove_folder
 from simtest.validation.runner import Progress
 from simtest.validation.scoring import peak_px
 
@@ -87,11 +90,15 @@ _WRITTEN = TypeAdapter(list[WrittenFrame])
 
 @dataclass(frozen=True)
 class ExportPart:
-    """Frames that one task writes into the folder `out`; `kept` is the file that it lists them in."""
+    """Frames that one task writes into the folder `out`.
+
+    `kept` is the file that it lists them in, `truth` the folder of their truths, if these are kept.
+    """
 
     frames: Frames
     out: Path
     kept: Path
+    truth: Path | None
 
 
 def check_exportable(experiment: Experiment) -> None:
@@ -163,10 +170,13 @@ def _write_frames(source: Source, out: Path, engine: Engine, progress: Progress 
     for folder in (kept, *(out / name for name in (FRAMES, PREVIEWS, CAMERAS))):
         folder.mkdir(parents=True, exist_ok=True)
     origin = hashlib.sha256(f"{source.fingerprint} {source.definition} {provenance.source_hash()}".encode()).hexdigest()
-    parts = [ExportPart(frames, out, kept / f"{origin[:12]}-{frames.key:05d}.json") for frames in source.parts]
+    total = sum(len(frames) for frames in source.parts)
+    truth = source.folder / TRUTH if source.kind == "run" and total <= MOST_KEPT else None
+    parts = [ExportPart(frames, out, kept / f"{origin[:12]}-{frames.key:05d}.json", truth) for frames in source.parts]
     done = {number: made for number, part in enumerate(parts) if (made := _written(part)) is not None}
     missing = [number for number in range(len(parts)) if number not in done]
-    total = sum(len(frames) for frames in source.parts)
+    if truth and not done:
+        remove_folder(truth)
     count = sum(map(len, done.values()))
 
     def step() -> None:
@@ -284,6 +294,11 @@ def write_part(part: ExportPart, on_step: OnStep) -> list[WrittenFrame]:
     made = []
     for each in part.frames.shown():
         made.append(_write_frame(each, part.out))
+        if part.truth and isinstance(each, RenderedFrame):
+            name, view = made[-1].name, each.view
+            path = kept_file(part.truth, name, view.scene, part.frames.variant)
+            truth = truth_of_view(name, view, each.session, image=each.image)
+            keep_truth(path, truth, brightest_mm(view.highlights))
         on_step()
     write_json(part.kept, [each.model_dump(mode="json") for each in made], compact=True)
     return made

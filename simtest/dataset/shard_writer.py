@@ -106,9 +106,9 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
     total = plan.dataset.samples
     done = total - sum(len(plan.shards[number].indices) for number in missing)
 
-    def step() -> None:
+    def step(count: int = 1) -> None:
         nonlocal done
-        done += 1
+        done += count
         if progress:
             progress(min(done, total), total, f"{manifest.dataset['name']}: samples")
 
@@ -117,6 +117,8 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
         # The tables of a dataset that was complete before no longer fit.
         manifest.tables = {}
         manifest.save(folder)
+        # The time left is measured from the end of the first sample on.
+        step(0)
     _write_shards(plan, manifest, folder, engine.run(write_shard, tasks, step), missing)
     # tables and card, of all shards
     if not manifest.tables or not all((folder / name).exists() for name in manifest.tables):

@@ -1,10 +1,12 @@
 """Templates of the pages, and text that may stand inside them."""
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from simtest.pages import style
+from simtest.runtime.arrays import cache_folder
 from simtest.runtime.files import as_json
 
 if TYPE_CHECKING:
@@ -33,11 +35,25 @@ TEMPLATES = [
 
 def environment() -> "Environment":
     """Return the templates of all rooms: text is escaped, and a name that is not given is an error."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from jinja2 import Environment, FileSystemBytecodeCache, FileSystemLoader, StrictUndefined
+    from jinja2.bccache import Bucket
 
+    class Compiled(FileSystemBytecodeCache):
+        """Compiled templates in the user's cache; what cannot be kept there is compiled again."""
+
+        def load_bytecode(self, bucket: Bucket) -> None:
+            with suppress(OSError):
+                super().load_bytecode(bucket)
+
+        def dump_bytecode(self, bucket: Bucket) -> None:
+            with suppress(OSError):
+                Path(self.directory).mkdir(parents=True, exist_ok=True)
+                super().dump_bytecode(bucket)
+
+    folder = cache_folder()
     made = Environment(
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
+        trim_blocks=True, lstrip_blocks=True, bytecode_cache=Compiled(str(folder)) if folder else None,
     )  # fmt: skip
     made.filters |= {
         "degrees": style.degrees,

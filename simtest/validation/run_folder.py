@@ -18,6 +18,8 @@ EXPORT = "export.json"
 """What was exported of a run (`simtest.dataset.export`); it stands in the run's folder."""
 EXPORTING = "exporting"
 """Folder of the lists of a run's export that is not finished."""
+TRUTH = "truth"
+"""Folder of the truths by which maps of its exported frames are scored (`simtest.dataset.scoring.dense`)."""
 
 
 def part_file(parts: Path, index: int) -> Path:
@@ -56,6 +58,7 @@ def prepare(folder: Path, digest: str) -> None:
         # Results of an earlier run stay until the new ones replace them.
         remove_folder(parts)
         remove_folder(folder / "gallery")
+        remove_folder(folder / TRUTH)
     parts.mkdir(parents=True, exist_ok=True)
     (folder / "gallery").mkdir(exist_ok=True)
     write_json(record, digest)
@@ -78,7 +81,7 @@ def check_folder(folder: Path) -> None:
     # What is no part of a run.
     held.pop(LOCK, None)
     own = {RESULTS, SUMMARY, "gallery", "figures", "guide.json", "index.html"}
-    own |= {PARTS, EXPORT, EXPORTING}
+    own |= {PARTS, EXPORT, EXPORTING, TRUTH}
     strangers = sorted(held.keys() - own)
     # Folders of those names alone may be anyone's, and a run would replace them.
     if not strangers and not held.keys() & {"results.parquet", PARTS}:

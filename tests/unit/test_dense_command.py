@@ -1,6 +1,7 @@
 """`simtest score` of maps, from the command line, on rendered frames: tissue, a lens, a view mask, an instrument."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -11,7 +12,11 @@ from simtest.cli.runs import WORDS
 from simtest.dataset.scoring.dense import score
 from simtest.dataset.scoring.dense.maps import METHODS
 from simtest.dataset.scoring.dense.score import frames_of
+from simtest.dataset.scoring.dense.truth import SURFACES
+from simtest.errors import InputError
 from simtest.rendering.bitmap import write_exr
+from simtest.spec import calibration_toml
+from simtest.validation.run_folder import TRUTH
 
 pytestmark = pytest.mark.render
 
@@ -91,6 +96,35 @@ def test_flipped_maps_of_rendered_frames_score_their_turn(run, here, maps, tmp_p
     assert "wall" not in json.dumps(record["counts"])
 
 
+def test_the_truth_that_an_export_kept_is_that_of_the_frames_rendered_again(run, tmp_path):
+    folder, kept = run
+    shutil.copytree(folder, tmp_path / "run")
+    assert len([*(tmp_path / "run" / TRUTH).iterdir()]) == len(kept)
+    shutil.rmtree(tmp_path / "run" / TRUTH)
+    for one, again in zip(kept, frames_of(tmp_path / "run"), strict=True):
+        where = again.scored
+        np.testing.assert_array_equal(one.scored, where)
+        np.testing.assert_array_equal(one.distance[where], again.distance[where])
+        for surface in SURFACES:
+            np.testing.assert_array_equal(one.normal[surface][where], again.normal[surface][where])
+            np.testing.assert_array_equal(one.curvature[surface][where], again.curvature[surface][where])
+        np.testing.assert_array_equal(one.zone, again.zone)
+        np.testing.assert_array_equal(one.image, again.image)
+        assert calibration_toml(one.calibration) == calibration_toml(again.calibration)
+        for name in ("name", "eps", "excluded", "setting", "swept", "scene"):
+            assert getattr(one, name) == getattr(again, name)
+
+
+def test_a_kept_truth_is_read_without_rendering_and_a_damaged_one_is_told(run, tmp_path, monkeypatch):
+    shutil.copytree(run[0], tmp_path / "run")
+    monkeypatch.setattr(score, "scored_frames", None)
+    assert len([*frames_of(tmp_path / "run")]) == len(run[1])
+    for file in (tmp_path / "run" / TRUTH).iterdir():
+        file.write_bytes(file.read_bytes()[:1000])
+    with pytest.raises(InputError, match="cannot be read"):
+        list(frames_of(tmp_path / "run"))
+
+
 @pytest.mark.slow
 def test_maps_in_exr_are_read(run, here, maps, tmp_path):
     on, truths = run
@@ -133,7 +167,7 @@ def test_names_of_maps_are_checked_before_anything_is_rendered(run, here, maps, 
     def render(*_):
         raise AssertionError("rendered")
 
-    monkeypatch.setattr(score, "scored_frames", render)
+    monkeypatch.setattr(score, "frames_of", render)
     np.save(maps / "stranger.npy", np.zeros((4, 4, 3)))
     code, _, errors = here("score", maps, "--on", run[0], "--out", tmp_path / "scored")
     assert code != 0
@@ -144,7 +178,7 @@ def test_a_stopped_score_does_not_say_that_it_goes_on(run, here, maps, tmp_path,
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(score, "scored_frames", stop)
+    monkeypatch.setattr(score, "frames_of", stop)
     np.save(maps / f"{run[1][0].name}.npy", np.zeros((4, 4, 3)))
     code, _, errors = here("score", maps, "--on", run[0], "--out", tmp_path / "scored")
     assert code == 130

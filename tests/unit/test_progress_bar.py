@@ -1,6 +1,7 @@
 """The progress bar: what it tells, step by step."""
 
 import signal
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -125,7 +126,8 @@ def test_a_stretch_of_work_is_measured_by_itself():
     first = [remaining.seconds(done, 6, float(done)) for done in range(7)]
     assert first[5] == pytest.approx(1.0)
     second = [remaining.seconds(done, 8, 100.0 + 10 * done) for done in range(9)]
-    assert second[:5] == [None] * 5
+    assert second[:3] == [None] * 3
+    assert second[3] == pytest.approx(50.0)
     assert second[6] == pytest.approx(20.0)
 
 
@@ -144,16 +146,33 @@ def test_bar_and_lines_tell_the_time_left_once_it_is_known(bars, monkeypatch, ca
         return said
 
     said = fields()
-    assert set(said[:5]) == {""}
+    assert set(said[:3]) == {""}
+    assert said[3] == "about 0:01:25 left"
     assert said[6] == "about 0:01:10 left"
     assert said[20] == ""
     bars.clear()
     capsys.readouterr()
     monkeypatch.setattr(progress, "at_terminal", lambda: False)
+    seconds[0] = 0.0
     fields()
     lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == "simtest: 1/20 plane (60 s)"
-    assert "simtest: 7/20 plane (90 s, about 65 s left)" in lines
+    assert lines[:3] == [
+        "simtest: 1/20 plane (60 s)",
+        "simtest: 3/20 plane (70 s, about 85 s left)",
+        "simtest: 5/20 plane (80 s, about 75 s left)",
+    ]
+
+
+def test_long_work_without_steps_shows_a_bar(bars, monkeypatch):
+    monkeypatch.setattr(progress, "LEAST_S", 0.01)
+    with progress_bar() as move:
+        until = time.monotonic() + 10.0
+        while not bars and time.monotonic() < until:
+            time.sleep(0.01)
+        (bar,) = bars
+        move(1, 1, "frame")
+    assert shown(bar) == [(1, 1, "writing the report")]
+    assert not bar.live.is_started
 
 
 def test_the_bar_tells_where_an_anatomy_must_be_made_first():

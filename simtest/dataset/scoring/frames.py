@@ -193,6 +193,10 @@ class Frames(Protocol):
     def case(self) -> int:
         """Index of the case; of a dataset 0."""
 
+    @property
+    def variant(self) -> str:
+        """Mitsuba's."""
+
     def __len__(self) -> int: ...
 
     def __iter__(self) -> Iterator[RenderedFrame]: ...

@@ -29,9 +29,11 @@ from simtest.dataset.scoring.dense.truth import (
     Key,
     cell_pixels,
     depth_source,
+    kept_file,
+    read_truth,
     truth_of_view,
 )
-from simtest.dataset.scoring.frames import read_record, scored_frames
+from simtest.dataset.scoring.frames import Use, open_source, read_record, scored_frames
 from simtest.errors import InputError
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime import provenance
@@ -39,6 +41,8 @@ from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json, write_parquet
 from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.statistics import Interval, mean_interval, median_interval, root_mean_square, share_interval
+from simtest.spec import Experiment
+from simtest.validation.run_folder import TRUTH
 from simtest.validation.runner import Progress
 
 TABLE, SUMMARY, PAGE = "dense.parquet", "dense.json", "index.html"
@@ -275,13 +279,36 @@ def frames_of(folder: Path, progress: Progress | None = None, total: int = 0) ->
     `scored_frames` does.
     """
     used: set[str] = set()
-    for each in scored_frames(folder):
+    kept = _kept_truths(folder)
+    for each in scored_frames(folder) if kept is None else kept:
         # One frame may stand for several realisations; it has one map.
         if each.name not in used:
             used.add(each.name)
-            yield truth_of_view(each.name, each.view, each.session, each.setting, each.swept, each.image, each.anatomy)
+            yield each if isinstance(each, FrameTruth) else truth_of_view(
+                each.name, each.view, each.session, each.setting, each.swept, each.image, each.anatomy
+            )  # fmt: skip
             if progress:
                 progress(len(used), total, each.name)
+
+
+def _kept_truths(folder: Path) -> Iterator[FrameTruth] | None:
+    """Return the truths that the export of a run kept, in the order of its cases; None where some are missing."""
+    record = read_record(folder)
+    source = open_source(folder, record)
+    if not isinstance(source.recipe, Experiment) or not (folder / TRUTH).is_dir():
+        return None
+    first: dict[str, Use] = {}
+    files = []
+    for use in record.uses:
+        first.setdefault(use.frame, use)
+    for use in first.values():
+        case = source.cases[use.case]
+        scene, drawn = case.scene(source.recipe, use.realisation)
+        path = kept_file(folder / TRUTH, use.frame, scene, source.variant)
+        files.append((path, use.frame, scene, case.setting, {**case.swept, **drawn}))
+    if not all(file[0].is_file() for file in files):
+        return None
+    return (read_truth(*file) for file in files)
 
 
 def write_score(score: DenseScore, out: Path, command: str = "") -> Path:

@@ -1,8 +1,11 @@
 """The truth of one frame, as far as dense maps are scored against it: its maps, and zones and cells of its pixels."""
 
+import hashlib
 import itertools
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
@@ -10,8 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Calibration
+from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.runtime.arrays import Array, Image, IntArray, Mask, short_repr
+from simtest.runtime import provenance
+from simtest.runtime.arrays import Array, Image, IntArray, Mask, short_repr, write_arrays
+from simtest.runtime.files import write_atomically
+from simtest.spec import Scene
 
 if TYPE_CHECKING:
     from simtest.rendering import Session, TruthMaps
@@ -92,10 +99,63 @@ def truth_of_view(
     swept: Mapping[str, object] | None = None, image: Image | None = None, scene: str = "",
 ) -> FrameTruth:  # fmt: skip
     """Return the truth of a rendered view; the session stands at its scene, which `scene` names."""
-    eps = float(np.linalg.norm(view.scene.rig.true_mm(), axis=1).max())
     return frame_truth(
-        name, session.truth(), session.camera, eps, view.spots.regions, image, view.calibration, setting, swept,
-        scene or view.scene.model_dump_json(),
+        name, session.truth(), session.camera, _eps(view.scene), view.spots.regions, image, view.calibration, setting,
+        swept, scene or view.scene.model_dump_json(),
+    )  # fmt: skip
+
+
+def _eps(scene: Scene) -> float:
+    return float(np.linalg.norm(scene.rig.true_mm(), axis=1).max())
+
+
+# Kept beside a run --------------------------------------------------------------------------------------------------
+
+MOST_KEPT = 64
+"""Runs of more exported frames keep no truth, of some 20 MB a frame of 640 x 480."""
+
+
+def kept_file(folder: Path, name: str, scene: Scene, variant: str) -> Path:
+    """Return the file of a frame's truth: named by all that it depends on besides the packages."""
+    key = f"{name} {variant} {provenance.source_hash()} {scene.model_dump_json()}"
+    return folder / f"{hashlib.sha256(key.encode()).hexdigest()[:16]}.npz"
+
+
+def keep_truth(path: Path, truth: FrameTruth, brightest_mm: float | None) -> None:
+    """Write the truth at a frame's scored pixels, without loss, and its picture; `brightest_mm` is what it is told."""
+    arrays = {
+        "scored": truth.scored, "zone": truth.zone, "image": truth.image, "distance": truth.distance[truth.scored],
+        "excluded": [truth.excluded[reason] for reason in EXCLUDED],
+        "brightest_mm": np.nan if brightest_mm is None else brightest_mm,
+    }  # fmt: skip
+    for surface in SURFACES:
+        arrays[f"normal_{surface}"] = truth.normal[surface][truth.scored]
+        arrays[f"curvature_{surface}"] = truth.curvature[surface][truth.scored]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda part: write_arrays(part, {key: np.asarray(value) for key, value in arrays.items()}))
+
+
+def read_truth(path: Path, name: str, scene: Scene, setting: str, swept: Mapping[str, object]) -> FrameTruth:
+    """Return a kept truth of a frame of a scene; maps are NaN where nothing is scored."""
+    try:
+        # Opened here: NumPy leaves a damaged file open.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            held = {key: file[key] for key in file.files}
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: cannot be read ({error}); without its folder all is rendered again") from error
+    scored, brightest = held["scored"], float(held["brightest_mm"])
+
+    def whole(key: str) -> Array:
+        full = np.full((*scored.shape, *held[key].shape[1:]), np.nan)
+        full[scored] = held[key]
+        return full
+
+    calibration = scene.calibration(None if np.isnan(brightest) else brightest)
+    return FrameTruth(
+        name, calibration.camera, {surface: whole(f"normal_{surface}") for surface in SURFACES},
+        {surface: whole(f"curvature_{surface}") for surface in SURFACES}, whole("distance"), _eps(scene), scored,
+        dict(zip(EXCLUDED, held["excluded"].tolist(), strict=True)), held["zone"], held["image"], calibration, setting,
+        dict(swept), scene.model_dump_json(),
     )  # fmt: skip
 
 
