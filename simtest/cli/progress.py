@@ -54,7 +54,7 @@ class Remaining:
         return None if pace is None else pace * (total - done)
 
     def _pace(self) -> float | None:
-        """Return the time of a step, s, over all of a few steps, else over the later half; None while it is not stable."""
+        """Return the time of a step, s: over all of a few, else over the later half; None while it is not stable."""
         if not self._ends:
             return None
         (start, began), (end, ended) = self._ends[0], self._ends[-1]

@@ -39,7 +39,11 @@ def environment() -> "Environment":
     from jinja2.bccache import Bucket
 
     class Compiled(FileSystemBytecodeCache):
-        """Compiled templates in the user's cache; what cannot be written there is compiled again."""
+        """Compiled templates in the user's cache; what cannot be kept there is compiled again."""
+
+        def load_bytecode(self, bucket: Bucket) -> None:
+            with suppress(OSError):
+                super().load_bytecode(bucket)
 
         def dump_bytecode(self, bucket: Bucket) -> None:
             with suppress(OSError):

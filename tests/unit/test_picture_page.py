@@ -17,6 +17,7 @@ from simtest.estimators.budget import PARTS
 from simtest.estimators.cloud_shape import CloudShape, Slope
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera, Patch
+from simtest.pages.html import environment
 from simtest.reconstruction import explanations
 from simtest.reconstruction.assumptions import LIGHT_AT_CAMERA, assumptions, calibration_of_view
 from simtest.reconstruction.options import Choices
@@ -245,3 +246,15 @@ def test_every_kind_reason_and_part_is_explained():
     assert set(explanations.KINDS) == {str(kind) for kind in Kind}
     assert set(explanations.REASONS) == {str(reason) for reason in Reason}
     assert set(explanations.PARTS) >= set(PARTS)
+
+
+def test_templates_are_compiled_once_and_again_where_nothing_can_be_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("SIMTEST_CACHE", str(tmp_path / "kept"))
+    environment().get_template("picture.html.j2")
+    assert list((tmp_path / "kept").glob("__jinja2_*.cache"))
+    monkeypatch.setattr("jinja2.environment.Environment.compile", None)
+    environment().get_template("picture.html.j2")
+    monkeypatch.undo()
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("SIMTEST_CACHE", str(tmp_path / "file"))
+    assert environment().get_template("picture.html.j2")
