@@ -119,13 +119,16 @@ def _enclosed(specularity: Specularity, points: Array) -> list[int]:
         return near
     # The border passes between pixel centres: where the four around a point agree, it need not be traced.
     sides = np.pad(patch.inside(HIGHLIGHT_ISOVALUE), 1)
-    found = []
-    for j in near:
-        column, row = np.floor(points[j] - PIXEL_CENTRE - patch.origin_px).astype(int) + 1
+
+    def holds(point: Array) -> bool:
+        column, row = np.floor(point - PIXEL_CENTRE - patch.origin_px).astype(int) + 1
         around = sides[max(row, 0) : row + 2, max(column, 0) : column + 2]
-        if around.all() if around.all() == around.any() else encloses(patch.isophote(HIGHLIGHT_ISOVALUE), points[j]):
-            found.append(j)
-    return found
+        if around.all() == around.any():
+            return bool(around.all())
+        contour = patch.isophote(HIGHLIGHT_ISOVALUE)
+        return not isinstance(contour, Failure) and encloses(contour, point)
+
+    return [j for j in near if holds(points[j])]
 
 
 MISSED = "missed"
