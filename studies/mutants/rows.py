@@ -242,7 +242,7 @@ ROWS = (
         "return dr.rcp(cosine + hidden)", "return dr.rcp(cosine)", "reflectances"),
     row("translucency: boundary term lost", "tissue", "rendering.subsurface:reflectance",
         "((decay + 1) * (decay + boundary))", "(decay + 1)", "translucency"),
-    row("translucency spreads half as far", "tissue", "rendering.subsurface:_fitted",
+    row("translucency spreads half as far", "tissue", "rendering.subsurface:_fit",
         "** (step / SCALES_PER_OCTAVE)\n", "** (step / SCALES_PER_OCTAVE - 1)\n", "translucency"),
     row("normals point away from the camera", "labels", "rendering.truth:in_camera",
         "normal=exact.normal @ rotation,", "normal=-exact.normal @ rotation,", "frames closed_form"),

@@ -3,6 +3,7 @@
 import hashlib
 import itertools
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -141,7 +142,7 @@ def read_truth(path: Path, name: str, scene: Scene, setting: str, swept: Mapping
         # Opened here: NumPy leaves a damaged file open.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             held = {key: file[key] for key in file.files}
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: cannot be read ({error}); without its folder all is rendered again") from error
     scored, brightest = held["scored"], float(held["brightest_mm"])
 
