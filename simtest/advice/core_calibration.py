@@ -42,8 +42,8 @@ from simtest.validation.runner import Progress, variant_of
 LEAST_BATCHES, MOST_BATCHES = 16, 500
 """Of `DISTANCES` frames each: with few frames a region must be wide, however many answers they hold."""
 
-LEAST_HIGHLIGHTS, LEAST_FRAMES, FEWEST_FRAMES = 200, 80, 50
-"""A stratum stands on so many answers in so many frames, or is no stratum of its own; a calibration, on the last."""
+LEAST_HIGHLIGHTS, LEAST_FRAMES = 200, 50
+"""A stratum stands on so many answers in so many frames, or is no stratum of its own."""
 
 ORDER: tuple[Feature, ...] = ("sigma_deg", "score", "flags", "radius_px", "border", "axis_ratio", "kind")
 """In which strata are parted."""
@@ -267,11 +267,11 @@ def calibrate_core(
     for target in ("fine", "base"):
         own = [(i, each) for i, frame in enumerate(frames) for each in frame["answers"] if each["target"] == target]
         of = np.array([i for i, _ in own], int)
-        if len(np.unique(of)) >= FEWEST_FRAMES:
+        if len(np.unique(of)) >= LEAST_FRAMES:
             seen: dict[Feature, Array] = {key: np.array([each[key] for _, each in own], float) for key in ORDER}
             strata[target] = strata_of(seen, np.array([each["error_deg"] for _, each in own]), of)
     if not strata:
-        raise InputError(f"{name}: answers in fewer than {FEWEST_FRAMES} of {len(frames)} frames")
+        raise InputError(f"{name}: answers in fewer than {LEAST_FRAMES} of {len(frames)} frames")
     told = [frame["statistics"] for frame in frames]
     calibration = CoreCalibration(
         core=name, scope=scope.name, size=scope.size, detector=detector, every=every, strata=strata,

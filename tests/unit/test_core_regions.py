@@ -417,7 +417,7 @@ def test_what_a_scope_states_is_not_drawn(tmp_path):
 @pytest.mark.slow
 def test_a_stopped_calibration_goes_on_to_the_same_file(tmp_path, monkeypatch):
     monkeypatch.setattr(core_calibration, "LEAST_BATCHES", 5)
-    monkeypatch.setattr(core_calibration, "FEWEST_FRAMES", 19)
+    monkeypatch.setattr(core_calibration, "LEAST_FRAMES", 19)
     text = "[camera]\nwidth = 64\nheight = 64\nfx = 40.0\nfy = 40.0\n[sensor]\npreset = 'colonoscope_hd'\n"
     (tmp_path / "scope.toml").write_text(text)
     question = Question(read_scope(str(tmp_path / "scope.toml")), "plane", seed=5)
