@@ -364,9 +364,9 @@ def core_(
 @calibrate.command
 @command
 def check(calibration: Path, pictures: list[Path], /) -> Told:
-    """Tell whether pictures are like the frames of a core's calibration, each and all together.
+    """Compare pictures with the frames of a core's calibration, each and all together.
 
-    Exit 1 if together they are not: its regions do not hold for them.
+    Exit 1 if together they are unlike: its regions do not hold for them.
 
     Parameters
     ----------

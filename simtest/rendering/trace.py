@@ -219,8 +219,8 @@ class Tracer:
         if camera.seen is not None and bounces is None:
             # Pixels outside of the view are dark; bounces draw their numbers by place among all.
             pixels = in_tiles(camera.seen)
-            channels = self._means(self._lanes_of(pixels, seed), samples, numbers, None,
-                                   _share_of(progress, len(pixels) * len(numbers)))  # fmt: skip
+            tell = _share_of(progress, len(pixels) * len(numbers))
+            channels = self.means_at(pixels, samples, seed, tell, numbers)
             whole = np.zeros((len(channels), camera.height * camera.width), dtype=channels.dtype)
             whole[:, pixels] = channels
             return list(whole.reshape(-1, camera.height, camera.width))
@@ -234,14 +234,13 @@ class Tracer:
         maps = untile(channels, (height, width))
         return [np.ascontiguousarray(channel[: camera.height, : camera.width]) for channel in maps]
 
-    def means_at(self, pixels: Pixels, samples: int, seed: int, tell: Tell | None = None) -> Image:
+    def means_at(
+        self, pixels: Pixels, samples: int, seed: int, tell: Tell | None = None, numbers: range | None = None
+    ) -> Image:
         """Compute channels, shape (C, N), of `mean` at some pixels by number; `tell` gets the samples traced."""
-        return self._means(self._lanes_of(pixels, seed), samples, range(samples), None, tell)
-
-    def _lanes_of(self, pixels: Pixels, seed: int) -> Iterator[tuple[Lanes, int]]:
-        """Return lanes of pixels by number, launch by launch, and how many these are."""
-        for first, count in blocks_of(len(pixels)):
-            yield self.sightlines.lanes_of(pixels[first : first + count], seed), count
+        blocks = ((self.sightlines.lanes_of(pixels[first : first + count], seed), count)
+                  for first, count in blocks_of(len(pixels)))  # fmt: skip
+        return self._means(blocks, samples, numbers or range(samples), None, tell)
 
     def _means(
         self,
