@@ -18,6 +18,7 @@ from simtest.rendering.kernel_values import MitsubaDict, spectrum
 from simtest.rendering.lighting import DirectLight
 from simtest.rendering.tissue_kernels import AlbedoKernel, ReliefKernel
 from simtest.rendering.truth import ShapeLabels
+from simtest.rendering.tube_kernel import TubeKernel
 from simtest.runtime.arrays import Array
 from simtest.spec.lights import LightSpec, Rig
 from simtest.spec.reflectance import Reflectance
@@ -66,6 +67,7 @@ class BuiltScene:
     base_parameters: Any
     labels: ShapeLabels | None = None  # What traces the labels of its shape; made when first needed
     edges: MeshEdges | None = None  # Of its mesh, see `mesh_edges`
+    tube: TubeKernel | None = None  # Of its shape's chart; made when first needed
     mesh: TriangleMesh | None = None  # The mesh as it was written last
 
     def write(self, shape: Shape, reflectance: Reflectance) -> None:

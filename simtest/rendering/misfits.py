@@ -56,7 +56,7 @@ def exact_misfit(
     """
     origins, r, turns = _sightlines(session, points_px)
     hits = session.exact_hits(origins, r)
-    base = session.surface.points(origins, r, hits)
+    base = session.base_points(origins, r, hits)
     N, position, relief = base.normal, base.position, session.surface.relief
     plane, derivative = session.surface.motion(base, hits) if faceted else (N, shape_operator(base))
     normal = N

@@ -27,6 +27,7 @@ from simtest.rendering.rays import HitRefinement, Sightlines
 from simtest.rendering.tissue_kernels import AlbedoKernel, ReliefKernel, RestMap
 from simtest.rendering.trace import Bounces, Progress, Tracer, as_radiance, evaluate, mean_over
 from simtest.rendering.truth import ShapeLabels, as_hits, as_labels
+from simtest.rendering.tube_kernel import TubeKernel
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
 from simtest.spec.camera import Motion
 from simtest.spec.reflectance import Translucency
@@ -335,6 +336,19 @@ class Session:
         return truth.solve(self.surface, *rays, self.exact_hits(*rays), fine)
 
     @_at_its_variant
+    def base_points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
+        """Return the exact points of the base, model frame, on rays of the model frame (see `exact_hits`)."""
+        return truth.base_points(self.surface, self._tube(), origins, directions, hits)
+
+    def _tube(self) -> TubeKernel | None:
+        """Return the kernel of the surface's chart, None without one."""
+        if (chart := self.surface.chart) is None:
+            return None
+        if self._built.tube is None:
+            self._built.tube = TubeKernel(chart)
+        return self._built.tube
+
+    @_at_its_variant
     def exact_hits(self, origins: Array, directions: Array) -> RayHits:
         """Return the hits from which exact points start, of rays of the model frame, shape (N, 3)."""
         return truth.trace_starts(self._built.scene, origins, directions)
@@ -370,7 +384,8 @@ class Session:
         centres = self.camera.pixel_centres()[::stride, ::stride]
         channels = [channel[::stride, ::stride] for channel in self._centre_hits()]
         hits, shading, geometric = as_hits(channels)
-        points = truth.solve_frame(self.surface, *self.sightlines.in_view(centres.reshape(-1, 2)), hits)
+        rays = self.sightlines.in_view(centres.reshape(-1, 2))
+        points = truth.solve_frame(self.surface, self._tube(), *rays, hits)
         return self._with_polyps(truth.truth_maps(points, shading, geometric, centres.shape[:2]), channels)
 
     def _with_polyps(self, maps: Maps[Real], channels: list[Image]) -> Maps[Real]:
@@ -386,7 +401,7 @@ class Session:
         if self._truth is not None:
             return self._truth.depth
         rays = self.sightlines.in_view(self.camera.pixel_centres().reshape(-1, 2))
-        distance = truth.frame_distances(self.surface, *rays, as_hits(self._centre_hits())[0])
+        distance = truth.frame_distances(self.surface, self._tube(), *rays, as_hits(self._centre_hits())[0])
         return distance.reshape(self.camera.height, self.camera.width)
 
     @_at_its_variant

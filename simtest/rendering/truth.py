@@ -276,26 +276,62 @@ _OF_BASE = {"normal_base": "normal", "k_min_base": "k_min", "k_max_base": "k_max
 
 Fields = dict[str, Array]
 Solver = Callable[[Array, Array, RayHits], Fields]
+PointSolver = Callable[[Array, Array, RayHits], SurfacePoints]
 
 
-def solve_frame(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
-    """Compute the exact points of many rays as `solve` does of a few; with a chart in a kernel."""
-    if surface.chart is None:
+def solve_frame(
+    surface: SurfaceModel, kernel: TubeKernel | None, origins: Array, directions: Array, hits: RayHits
+) -> SurfacePoints:
+    """Compute the exact points of many rays as `solve` does of a few; with a chart in its kernel."""
+    if kernel is None:
         whole = _in_blocks(partial(_of_numpy, surface), BLOCK, origins, directions, hits)
     else:
-        solver = partial(_of_kernel, TubeKernel(surface.chart), surface)
-        whole = _in_blocks(solver, tube_kernel.BLOCK, origins, directions, hits)
+        whole = _in_blocks(partial(_of_kernel, kernel, surface), tube_kernel.BLOCK, origins, directions, hits)
     # One array stands for both surfaces where they are one.
     shared = {base: whole[fine] for base, fine in _OF_BASE.items() if base not in whole}
     return SurfacePoints(**{**whole, **shared})  # type: ignore[arg-type]
 
 
-def frame_distances(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits) -> Array:
+def frame_distances(
+    surface: SurfaceModel, kernel: TubeKernel | None, origins: Array, directions: Array, hits: RayHits
+) -> Array:
     """Compute the exact distances of many rays, shape (N,), mm: those of `solve_frame`."""
-    block, solver = BLOCK, surface.distances
-    if surface.chart is not None:
-        block, solver = tube_kernel.BLOCK, TubeKernel(surface.chart).distances
-    return _in_blocks(lambda *rays: {"": solver(*rays)}, block, origins, directions, hits)[""]
+
+    def solver(*rays: Any) -> Fields:
+        if kernel is None:
+            return {"distance": surface.distances(*rays)}
+        return _with_stalks(kernel, {"distance": kernel.distances(*rays)}, *rays, surface.points)
+
+    return _in_blocks(solver, BLOCK if kernel is None else tube_kernel.BLOCK, origins, directions, hits)["distance"]
+
+
+def base_points(
+    surface: SurfaceModel, kernel: TubeKernel | None, origins: Array, directions: Array, hits: RayHits
+) -> SurfacePoints:
+    """Compute the exact points of the base, model frame, on rays; with a chart in its kernel."""
+    if kernel is None:
+        return surface.points(origins, directions, hits)
+    rays = origins, directions, hits
+    base = _with_stalks(kernel, kernel.solve(*rays, np.eye(4)), *rays, surface.points)
+    return SurfacePoints(**base, **{name: base[fine] for name, fine in _OF_BASE.items()})  # type: ignore[arg-type]
+
+
+def _with_stalks(
+    kernel: TubeKernel, found: Fields, origins: Array, directions: Array, hits: RayHits, solver: PointSolver
+) -> Fields:
+    """Return a kernel's fields of points, those that pedunculated polyps may move solved by a surface itself."""
+    if kernel.tube.has_stalks:
+        # Both where the mesh was hit and where the bare tube was: neither alone tells of every point.
+        hit = np.flatnonzero(np.isfinite(hits.distance))
+        starts, towards = origins[hit], directions[hit]
+        near = np.zeros(len(hit), dtype=bool)
+        for distance in (hits.distance[hit], np.nan_to_num(found["distance"][hit])):
+            near |= kernel.tube.moved_by_stalks(starts + distance[:, None] * towards)
+        some = hit[near]
+        points = solver(origins[some], directions[some], hits.rows(some))
+        for name, values in found.items():
+            values[some] = getattr(points, name)
+    return found
 
 
 def _in_blocks(solver: Solver, block: int, origins: Array, directions: Array, hits: RayHits) -> Fields:
@@ -322,12 +358,12 @@ def _of_kernel(
 ) -> dict[str, Array]:
     """Return what `_of_numpy` returns, with the base's points solved by the kernel."""
     if surface.relief is None:
-        return kernel.solve(origins, directions, hits, surface.model_from_camera)
+        found = kernel.solve(origins, directions, hits, surface.model_from_camera)
+        return _with_stalks(kernel, found, origins, directions, hits, partial(solve, surface))
     # The relief is applied in the model frame, in blocks as above.
-    base = kernel.solve(origins, directions, hits, np.eye(4))
-    base |= {name: base[fine] for name, fine in _OF_BASE.items()}
+    base = vars(base_points(surface, kernel, origins, directions, hits))
     parts = []
     for start in range(0, max(len(directions), 1), BLOCK):
-        points = SurfacePoints(**{name: values[start : start + BLOCK] for name, values in base.items()})  # type: ignore[arg-type]
+        points = SurfacePoints(**{name: values[start : start + BLOCK] for name, values in base.items()})
         parts.append(vars(in_camera(surface, surface.relief.apply(points))))
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

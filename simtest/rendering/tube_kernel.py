@@ -78,10 +78,10 @@ class _Table:
 
 
 class TubeKernel:
-    """Solves rays against a tube."""
+    """Solves rays against a tube without its pedunculated polyps."""
 
     def __init__(self, chart: TubeChart) -> None:
-        numbers = chart.tube.numbers()
+        self.tube, numbers = chart.tube, chart.tube.numbers()
         self._folds, self._panels = _Table(numbers.folds), _Table(numbers.panels)
         self._waves = _Table(numbers.waves) if len(numbers.waves) else None
         self._corners = _Table(chart.corners.reshape(-1, 2))

@@ -53,9 +53,9 @@ class Colon(MeshedSurface):
         self.on_polyp = on_polyp  # (F,): which triangles may show a polyp
 
     @property
-    def chart(self) -> TubeChart | None:
-        """The tube's parameters on the mesh (see `SurfaceModel.chart`); None with pedunculated polyps."""
-        return None if self.tube.has_stalks else TubeChart(self.tube, self.corners)
+    def chart(self) -> TubeChart:
+        """The tube's parameters on the mesh (see `SurfaceModel.chart`)."""
+        return TubeChart(self.tube, self.corners)
 
     def vertex_shape_operators(self) -> Array:
         """Return S by the tube's formulas (see `SurfaceModel.vertex_shape_operators`)."""

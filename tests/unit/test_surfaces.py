@@ -13,6 +13,7 @@ from surface_helpers import RELIEF, STENCIL, angle, curvatures, normals, relativ
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.rendering import Session, backend, truth, tube_kernel
+from simtest.rendering.tube_kernel import TubeKernel
 from simtest.spec import scene_from_dict
 from simtest.surfaces import RayHits, SurfacePoints, make_surface
 from simtest.surfaces.deformation import DeformedSurface
@@ -328,7 +329,8 @@ def test_blocks_give_what_one_piece_gives_and_a_miss_is_one_in_all(session, name
     backend.load()
     for count in (0, 1, 150, 1000):
         some = origins[:count], directions[:count], hits.rows(slice(count))
-        whole, blocks = truth.solve(surface, *some), truth.solve_frame(surface, *some)
+        kernel = None if surface.chart is None else TubeKernel(surface.chart)
+        whole, blocks = truth.solve(surface, *some), truth.solve_frame(surface, kernel, *some)
         assert not whole.valid[::7].any()
         assert not whole.valid[8:9].any()
         assert count < 2 or whole.valid.mean() > 0.2
