@@ -300,7 +300,7 @@ def frame_distances(
     def solver(*rays: Any) -> Fields:
         if kernel is None:
             return {"distance": surface.distances(*rays)}
-        return _with_stalks(kernel, {"distance": kernel.distances(*rays)}, *rays, surface.points)
+        return _with_stalks(kernel, surface.points, {"distance": kernel.distances(*rays)}, *rays)
 
     return _in_blocks(solver, BLOCK if kernel is None else tube_kernel.BLOCK, origins, directions, hits)["distance"]
 
@@ -312,12 +312,12 @@ def base_points(
     if kernel is None:
         return surface.points(origins, directions, hits)
     rays = origins, directions, hits
-    base = _with_stalks(kernel, kernel.solve(*rays, np.eye(4)), *rays, surface.points)
+    base = _with_stalks(kernel, surface.points, kernel.solve(*rays, np.eye(4)), *rays)
     return SurfacePoints(**base, **{name: base[fine] for name, fine in _OF_BASE.items()})  # type: ignore[arg-type]
 
 
 def _with_stalks(
-    kernel: TubeKernel, found: Fields, origins: Array, directions: Array, hits: RayHits, solver: PointSolver
+    kernel: TubeKernel, solver: PointSolver, found: Fields, origins: Array, directions: Array, hits: RayHits
 ) -> Fields:
     """Return a kernel's fields of points, those that pedunculated polyps may move solved by a surface itself."""
     if kernel.tube.has_stalks:
@@ -359,7 +359,7 @@ def _of_kernel(
     """Return what `_of_numpy` returns, with the base's points solved by the kernel."""
     if surface.relief is None:
         found = kernel.solve(origins, directions, hits, surface.model_from_camera)
-        return _with_stalks(kernel, found, origins, directions, hits, partial(solve, surface))
+        return _with_stalks(kernel, partial(solve, surface), found, origins, directions, hits)
     # The relief is applied in the model frame, in blocks as above.
     base = vars(base_points(surface, kernel, origins, directions, hits))
     parts = []
