@@ -14,6 +14,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial import cKDTree
 
+from simtest.geometry.vectors import first_of_each
 from simtest.rendering import Session, highlights
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import key
@@ -313,7 +314,7 @@ def exhaustive(session: Session) -> Array:
     camera = session.camera
     rows, columns = np.mgrid[0 : camera.height : BLOCK_PX, 0 : camera.width : BLOCK_PX]
     blocks = np.stack([columns.ravel(), rows.ravel()], axis=1)
-    w = session.tile_misfits(0, FINER, blocks, BLOCK_PX)
+    w = session.tile_misfits(np.zeros(len(blocks), dtype=int), FINER, blocks, BLOCK_PX)
     corners = np.stack([w[..., :-1, :-1], w[..., 1:, :-1], w[..., :-1, 1:], w[..., 1:, 1:]])
     with np.errstate(invalid="ignore"):
         may = ((corners.min(axis=0) <= 0) & (corners.max(axis=0) >= 0)).all(axis=0)
@@ -321,7 +322,7 @@ def exhaustive(session: Session) -> Array:
     seeds = blocks[own] + np.stack([right, below], axis=1) / FINER
     found, _ = highlights.refine(session, seeds, np.zeros(len(seeds), dtype=np.int64), True)
     found = found[session.camera.contains(found)]
-    return found[highlights.first_of_each(found, highlights.SAME_PX["fine"])]
+    return found[first_of_each(found, highlights.SAME_PX["fine"])]
 
 
 def search(name: str, seed: int, slope_deg: float, wavelength_mm: float) -> tuple[int, int, float]:

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import InputError
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, Mask
 
 _ROUNDED = 1e-2
 """How far the length of a quaternion may be from 1: files hold rounded numbers."""
@@ -152,3 +152,25 @@ def dot(first: Array, second: Array) -> Array:
 def projector(normals: Array) -> Array:
     """Return I - N N^T, shape (N, 3, 3), of unit normals, shape (N, 3): the projection along each."""
     return np.eye(3) - normals[:, :, None] * normals[:, None, :]
+
+
+def first_of_each(points: Array, apart: float) -> Mask:
+    """Return which points, shape (N, D), to keep so that no two are within a distance; earlier points win."""
+    kept, undecided = np.zeros(len(points), dtype=bool), np.ones(len(points), dtype=bool)
+    if len(points) < 2:
+        return undecided
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(points).query_pairs(apart, output_type="ndarray")
+    first, second = pairs.min(axis=1), pairs.max(axis=1)
+    while len(first):
+        # A point without an earlier undecided neighbour stays; its neighbours go.
+        beaten = np.zeros(len(points), dtype=bool)
+        beaten[second] = True
+        stays = undecided & ~beaten
+        kept |= stays
+        undecided &= ~stays
+        undecided[second[stays[first]]] = False
+        live = undecided[first] & undecided[second]
+        first, second = first[live], second[live]
+    return kept | undecided

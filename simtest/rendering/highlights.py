@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from simtest.geometry.vectors import first_of_each
 from simtest.rendering.frames import HighlightPoint, Radiance
 from simtest.rendering.misfits import crossed, exact_misfit
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
@@ -122,7 +123,7 @@ def find_zeros(session: "Session", fine: bool) -> tuple[Array, IntArray]:
     """Find the zeros of all lights' misfits; return their pixels, shape (N, 2), and lights by index, shape (N,)."""
     count = len(session.scene.rig.lights)
     if fine:
-        seeds = [_fine_seeds(session, light) for light in range(count)]
+        seeds = _fine_seeds(session)
     else:
         maps = session.misfits(1 if session.surface.relief is not None else SMOOTH_STRIDE_PX)
         least = SPARED * MIN_GAIN * maps.stride / max(session.camera.fx, session.camera.fy)
@@ -136,28 +137,32 @@ def find_zeros(session: "Session", fine: bool) -> tuple[Array, IntArray]:
     inside = np.flatnonzero(session.camera.contains(zeros))
     order = inside[np.lexsort((zeros[inside, 0], zeros[inside, 1], lights[inside]))]
     zeros, lights = zeros[order], lights[order]
-    kept = first_of_each(zeros, SAME_PX["fine" if fine else "base"], lights)
+    kept = first_of_light(zeros, SAME_PX["fine" if fine else "base"], lights)
     return zeros[kept], lights[kept]
 
 
-def _fine_seeds(session: "Session", light: int) -> Array:
-    """Return where a light's glints may be, shape (N, 2), px, in the part of the frame that resolves the relief."""
-    waves = wave_px(session)
+def _fine_seeds(session: "Session") -> list[Array]:
+    """Return where glints may be, of each light shape (N, 2), px, in the part of the frame that resolves the relief."""
+    maps, waves = session.misfits(), wave_px(session)
     resolved = waves >= LEAST_WAVE_PX
     if not resolved.any():
-        return np.empty((0, 2))
+        return [np.empty((0, 2)) for _ in maps.fine]
     # As fine as most of the resolved part of the frame needs; where one cell a pixel will do its own maps serve.
     parts = int(np.clip(np.ceil(GRID_WAVE / np.percentile(waves[resolved][::8], 10)), 1, MAX_DIVISION))
-    maps = session.misfits()
-    w, first = maps.fine[light][:, None], np.zeros((1, 2), dtype=np.int64)
+    grids = [(w[:, None], np.zeros((1, 2), dtype=np.int64)) for w in maps.fine]
     if parts > 1:
-        tiles = tiles_near_zeros(maps.fine[light])
-        if not len(tiles):
-            return np.empty((0, 2))
-        w, first = session.tile_misfits(light, parts, tiles - maps.margin, TILE_PX), tiles * parts - 1
-    seeds = (grid_seeds(w, first) + 0.5) / parts - maps.margin
-    columns, rows = np.clip(seeds.astype(int), 0, np.array(waves.shape[::-1]) - 1).T
-    return seeds[resolved[rows, columns]]
+        # The tiles of all lights in one launch.
+        tiles = [tiles_near_zeros(w) for w in maps.fine]
+        every, lights = np.concatenate(tiles), np.repeat(np.arange(len(tiles)), list(map(len, tiles)))
+        traced = session.tile_misfits(lights, parts, every - maps.margin, TILE_PX)
+        own = np.split(traced, np.cumsum(list(map(len, tiles)))[:-1], axis=1)
+        grids = [(w, first * parts - 1) for w, first in zip(own, tiles, strict=True)]
+    found = []
+    for w, first in grids:
+        seeds = (grid_seeds(w, first) + 0.5) / parts - maps.margin
+        columns, rows = np.clip(seeds.astype(int), 0, np.array(waves.shape[::-1]) - 1).T
+        found.append(seeds[resolved[rows, columns]])
+    return found
 
 
 def tiles_near_zeros(w: Image) -> IntArray:
@@ -186,6 +191,8 @@ def grid_seeds(w: Image, first: IntArray, least_slope: float = 0.0) -> Array:
     The misfit is of shape (2, T, h, w); `first` are columns and rows, shape (T, 2), of the grids' first cells. Seeds
     are dropped where the misfit's slope along some direction is less than `least_slope` per cell.
     """
+    if not len(first):
+        return np.empty((0, 2))
     blocks = range(0, len(first), max(1, CACHED // math.prod(w.shape[2:])))
     parts = [_candidates(w[:, at : at + blocks.step], first[at : at + blocks.step], least_slope) for at in blocks]
     seeds, is_stepped = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
@@ -259,25 +266,15 @@ def refine(session: "Session", seeds: Array, lights: IntArray, fine: bool) -> tu
         of_light.append(light[done])
         kept = np.flatnonzero(going & ~done)
         if number in MERGING:
-            kept = kept[first_of_each(place[kept], MERGED_PX, light[kept])]
+            kept = kept[first_of_light(place[kept], MERGED_PX, light[kept])]
         place, light, least, since = place[kept], light[kept], least[kept], since[kept]
     return np.concatenate(zeros), np.concatenate(of_light)
 
 
-def first_of_each(points: Array, apart: float, owners: IntArray | None = None) -> Mask:
-    """Return which points, shape (N, 2), have no earlier one that stays, of the same owner, within a distance."""
-    kept = [True] * len(points)
-    if len(points) < 2:
-        return np.array(kept, dtype=bool)
-    from scipy.spatial import cKDTree
-
-    # Owners are a coordinate along which they are farther apart.
-    owned = points if owners is None else np.column_stack([points, 2 * apart * owners])
-    pairs = np.sort(cKDTree(owned).query_pairs(apart, output_type="ndarray"), axis=1)
-    for i, j in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].tolist():
-        if kept[i]:
-            kept[j] = False
-    return np.array(kept)
+def first_of_light(points: Array, apart: float, lights: IntArray) -> Mask:
+    """Return which points, shape (N, 2), have no earlier one that stays, of the same light, within a distance."""
+    # Lights are a coordinate along which they are farther apart.
+    return first_of_each(np.column_stack([points, 2 * apart * lights]), apart)
 
 
 def describe(session: "Session", pixels: Array, lights: IntArray, fine: bool) -> list[HighlightPoint]:

@@ -143,17 +143,18 @@ def trace_misfits(tracer: Tracer, lights: Array, stride: int) -> MisfitMaps:
     return MisfitMaps(channels[0], both[0], both[-1], MARGIN, stride)
 
 
-def trace_tiles(tracer: Tracer, light: Array, division: int, corners: IntArray, size: int) -> Image:
-    """Trace the misfit of the fine normal for a light, shape (3,), camera frame, mm, in tiles of divided pixels.
+def trace_tiles(tracer: Tracer, lights: Array, division: int, corners: IntArray, size: int) -> Image:
+    """Trace the misfit of the fine normal in tiles of divided pixels, each for its light.
 
-    `division` is the cells of a pixel along both axes, `corners`, shape (T, 2), columns and rows of the tiles' first
-    pixels, `size` the pixels along a tile's side. Returns the misfit at the cells' centres with one cell beyond each
-    side, shape (2, T, n, n), n = `size` `division` + 2; NaN where there is no surface.
+    `lights`, shape (T, 3), are the tiles' lights, camera frame, mm, `division` the cells of a pixel along both axes,
+    `corners`, shape (T, 2), columns and rows of the tiles' first pixels, `size` the pixels along a tile's side. Returns
+    the misfit at the cells' centres with one cell beyond each side, shape (2, T, n, n), n = `size` `division` + 2; NaN
+    where there is no surface.
     """
     across = size * division + 2
-    source, width, cells = mi.Vector3f(*light.tolist()), mi.UInt32(across), mi.Float(division)
-    dr.make_opaque(source, width, cells)
-    step, pieces = max(1, LANES // across**2), []
+    width, cells = mi.UInt32(across), mi.Float(division)
+    dr.make_opaque(width, cells)
+    step, pieces = max(1, LANES // across**2), [np.empty((2, 0, across, across), dtype=np.float32)]
     for first in range(0, len(corners), step):
         chosen = corners[first : first + step]
         count = len(chosen) * across**2
@@ -161,10 +162,12 @@ def trace_tiles(tracer: Tracer, light: Array, division: int, corners: IntArray, 
         line = index // width
         tile = line // width
         within = (index - line * width, line - tile * width)
-        starts = (mi.Float(np.ascontiguousarray(axis, dtype=np.float32)) for axis in chosen.T)
-        x, y = (dr.gather(mi.Float, start, tile) + (mi.Float(cell) + (PIXEL_CENTRE - 1)) / cells
+        of_tile = np.concatenate([chosen, lights[first : first + step]], axis=1)
+        *starts, a, b, c = (dr.gather(mi.Float, mi.Float(np.ascontiguousarray(axis, dtype=np.float32)), tile)
+                            for axis in of_tile.T)  # fmt: skip
+        x, y = (start + (mi.Float(cell) + (PIXEL_CENTRE - 1)) / cells
                 for start, cell in zip(starts, within, strict=True))  # fmt: skip
-        channels = evaluate(_misfits_at(tracer, x, y, [source], base=False)[1:], count)
+        channels = evaluate(_misfits_at(tracer, x, y, [mi.Vector3f(a, b, c)], base=False)[1:], count)
         pieces.append(np.stack(channels).reshape(2, len(chosen), across, across))
     return np.concatenate(pieces, axis=1)
 

@@ -111,7 +111,9 @@ def check_motion(scene: Scene, surface: SurfaceModel) -> None:
 def _check_rims(scene: Scene, surface: SurfaceModel, positions: Array) -> None:
     """Raise `InputError` where the rim of a source, or what it encloses, touches tissue."""
     rims = {i: _rim_points(light, positions[i]) for i, light in enumerate(scene.rig.lights) if light.source}
-    if not rims:
+    # Next to the free camera nothing has to be looked up.
+    farthest = max((np.linalg.norm(points, axis=1).max() for points in rims.values()), default=0.0)
+    if farthest < surface.free_mm(surface.model_from_camera[:3, 3]) or not rims:
         return
     every = _clearances(surface, np.concatenate(list(rims.values())))
     ends = np.cumsum([len(points) for points in rims.values()])[:-1]

@@ -366,9 +366,9 @@ class Session:
         return self._misfits
 
     @_at_its_variant
-    def tile_misfits(self, light: int, division: int, corners: IntArray, size: int) -> Image:
-        """Return the fine misfit of one light in tiles of divided pixels (see `trace_tiles`)."""
-        return trace_tiles(self._tracer(), self.scene.rig.true_mm()[light], division, corners, size)
+    def tile_misfits(self, lights: IntArray, division: int, corners: IntArray, size: int) -> Image:
+        """Return the fine misfit in tiles of divided pixels, each of its light by index (see `trace_tiles`)."""
+        return trace_tiles(self._tracer(), self.scene.rig.true_mm()[lights], division, corners, size)
 
     @_at_its_variant
     def truth(self, stride: int = 1) -> TruthMaps:

@@ -203,6 +203,10 @@ class SurfaceModel(ABC):
         The sign is exact; the magnitude may be of first order.
         """
 
+    def free_mm(self, point: Array) -> float:
+        """Return the radius of a ball around a free point, shape (3,), that meets no wall, mm; 0: not known."""
+        return 0.0
+
     def vertex_shape_operators(self) -> Array | None:
         """Return S at the rendered mesh's vertices for its normals, 1/mm, shape (V, 3, 3); None without a mesh."""
         return None

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from simtest.geometry.vectors import dot, projector, unit
+from simtest.geometry.vectors import dot, first_of_each, projector, unit
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.spec.reflectance import Vessels
 from simtest.surfaces.analytic import QUADRIC_REACH, Cylinder, Plane, Quadric, Sphere
@@ -327,26 +327,8 @@ def spread_points(patch: PatternPatch, distance_mm: float, rng: np.random.Genera
     """Draw points, mm, and unit normals, shape (N, 3), no two nearer than a distance, about as dense as that allows."""
     count = max(16, math.ceil(CANDIDATES * patch.area / distance_mm**2))
     points, normals = patch.draw(rng, count)
-    kept = thinned(points, distance_mm)
+    kept = first_of_each(points, distance_mm)
     return points[kept], normals[kept]
-
-
-def thinned(points: Array, distance: float) -> Mask:
-    """Return which points, shape (N, 3), to keep so that no two are nearer than a distance; earlier points win."""
-    pairs = scipy.spatial.cKDTree(points).query_pairs(distance, output_type="ndarray")
-    first, second = pairs.min(axis=1), pairs.max(axis=1)
-    kept, undecided = np.zeros(len(points), dtype=bool), np.ones(len(points), dtype=bool)
-    while len(first):
-        # A point without an earlier undecided neighbour stays; its neighbours go.
-        beaten = np.zeros(len(points), dtype=bool)
-        beaten[second] = True
-        stays = undecided & ~beaten
-        kept |= stays
-        undecided &= ~stays
-        undecided[second[stays[first]]] = False
-        live = undecided[first] & undecided[second]
-        first, second = first[live], second[live]
-    return kept | undecided
 
 
 NODES_PER_SPACING = 2.5
@@ -426,7 +408,7 @@ def _grow(
 ) -> tuple[Array, Array, IntArray, Array]:
     """Grow one system, whose ends are so far apart, mm; return positions, normals, parents and radii."""
     points, normals = spread_points(patch, spacing / NODES_PER_SPACING, rng)
-    ends = thinned(points, spacing * 0.8)
+    ends = first_of_each(points, spacing * 0.8)
     graph = _neighbours(points, normals, spec.tortuosity, rng)
     trees = max(1, round(ends.sum() * (spec.smallest_mm / spec.largest_mm) ** 3))
     parent, order = _trees(graph, _roots(points, trees, rng), ends)

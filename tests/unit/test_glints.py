@@ -119,12 +119,13 @@ def test_search_by_tiles_is_that_of_the_whole_divided_frame(divided, monkeypatch
 def test_tiles_hold_the_frames_own_misfits(divided):
     maps = divided.misfits()
     corners = np.array([[0, 0], [196, 156], [64, 32], [100, 8]])
-    tiles = divided.tile_misfits(0, 1, corners, 4)
+    lights = np.zeros(4, dtype=int)
+    tiles = divided.tile_misfits(lights, 1, corners, 4)
     for number, (column, row) in enumerate(corners + maps.margin - 1):
         expected = maps.fine[0][:, row : row + 6, column : column + 6]
         np.testing.assert_allclose(tiles[:, number], expected, rtol=0, atol=1e-6)
     # Of pixels cut in three, the middle cells have the pixels' own centres.
-    middle = divided.tile_misfits(0, 3, corners, 4)[:, :, 2:-1:3, 2:-1:3]
+    middle = divided.tile_misfits(lights, 3, corners, 4)[:, :, 2:-1:3, 2:-1:3]
     np.testing.assert_allclose(middle, tiles[:, :, 1:-1, 1:-1], rtol=0, atol=2e-4)
 
 

@@ -128,7 +128,7 @@ def test_a_streak_and_a_whole_wall_that_bisects_are_no_points(kind):
     assert Session(scene_from_dict(tables)).highlights() == []
 
 
-def test_first_of_each_keeps_the_earliest_of_each_light():
+def test_the_earliest_point_of_each_light_is_kept():
     points = np.array([[1.0, 1.0], [1.3, 1.0], [1.0, 1.0], [9.0, 1.0], [9.2, 1.4], [9.2, 1.5]])
-    kept = highlights.first_of_each(points, 0.5, np.array([0, 0, 1, 0, 0, 0]))
+    kept = highlights.first_of_light(points, 0.5, np.array([0, 0, 1, 0, 0, 0]))
     assert kept.tolist() == [True, False, True, True, False, True]
