@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import polars as pl
 
@@ -79,6 +80,9 @@ def recipes() -> dict[str, Dataset]:
 
 def measure(dataset: Dataset, anatomies: int = ANATOMIES, samples: int = SAMPLES) -> Measured:
     """Make some samples of new anatomies one by one, and write them."""
+    # One thread, as a worker has that shares the processor with others.
+    os.environ["SIMTEST_THREADS"] = "1"
+    cv2.setNumThreads(1)
     plan = Plan(dataset)
     maker = Maker(plan)
     size = dataset.samples_per_anatomy
