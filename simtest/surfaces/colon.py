@@ -174,8 +174,13 @@ def _split(
     The shipped colon has none. `surface` holds positions and normals at the vertices; edges between vertices before
     `fresh` have been checked already.
     """
-    edges, index = face_edges(faces)
     positions, at_ends = surface
+    # Only faces with a new vertex can be cut, and those beside them.
+    near = np.zeros(len(parameters), dtype=bool)
+    near[faces[(faces >= fresh).any(axis=1)]] = True
+    active = near[faces].any(axis=1)
+    some = faces[active]
+    edges, index = face_edges(some)
 
     def between(chosen: IntArray, share: float = 0.5) -> Array:
         (u0, v0), (u1, v1) = parameters[edges[chosen]].transpose(1, 2, 0)
@@ -193,15 +198,21 @@ def _split(
     rough = [np.flatnonzero(length > longest), new[bent]]
     if tube.has_stalks:
         # A stretched edge may be bent both ways, which its middle alone does not show: its quarters count too.
-        stretched = new[(length[new] > QUARTERED * longest) & tube.moved_by_stalks(positions)[edges[new]].any(axis=1)]
+        moved = near.copy()
+        moved[near] = tube.moved_by_stalks(positions[near])
+        stretched = new[(length[new] > QUARTERED * longest) & moved[edges[new]].any(axis=1)]
         for share in (0.25, 0.75):
             off = off_between(at_ends[edges[stretched]], normals(stretched, share), share, MAX_NORMAL_ERROR_DEG)
             rough.append(stretched[off])
         # A thin triangle may face away from the lumen: its longest edge is halved.
-        turned = np.flatnonzero(_facing(positions, at_ends, faces) < LEAST_FACING)
+        turned = np.flatnonzero(_facing(positions, at_ends, some) < LEAST_FACING)
         rough.append(index[turned, length[index[turned]].argmax(axis=1)])
     chosen = np.unique(np.concatenate(rough))
-    return np.vstack([parameters, between(chosen)]), halve(faces, index, chosen, len(parameters), len(edges))
+    # Whole faces come first, in the order of all.
+    whole = ~np.isin(index, chosen).any(axis=1)
+    cut = halve(some, index, chosen, len(parameters), len(edges))[np.count_nonzero(whole) :]
+    active[active] = ~whole
+    return np.vstack([parameters, between(chosen)]), np.concatenate([faces[~active], cut])
 
 
 def _facing(positions: Array, normals: Array, faces: IntArray) -> Array:
