@@ -276,7 +276,6 @@ _OF_BASE = {"normal_base": "normal", "k_min_base": "k_min", "k_max_base": "k_max
 
 Fields = dict[str, Array]
 Solver = Callable[[Array, Array, RayHits], Fields]
-PointSolver = Callable[[Array, Array, RayHits], SurfacePoints]
 
 
 def solve_frame(
@@ -296,13 +295,8 @@ def frame_distances(
     surface: SurfaceModel, kernel: TubeKernel | None, origins: Array, directions: Array, hits: RayHits
 ) -> Array:
     """Compute the exact distances of many rays, shape (N,), mm: those of `solve_frame`."""
-
-    def solver(*rays: Any) -> Fields:
-        if kernel is None:
-            return {"distance": surface.distances(*rays)}
-        return _with_stalks(kernel, surface.points, {"distance": kernel.distances(*rays)}, *rays)
-
-    return _in_blocks(solver, BLOCK if kernel is None else tube_kernel.BLOCK, origins, directions, hits)["distance"]
+    block, solver = (BLOCK, surface.distances) if kernel is None else (tube_kernel.BLOCK, kernel.distances)
+    return _in_blocks(lambda *rays: {"": solver(*rays)}, block, origins, directions, hits)[""]
 
 
 def base_points(
@@ -311,27 +305,8 @@ def base_points(
     """Compute the exact points of the base, model frame, on rays; with a chart in its kernel."""
     if kernel is None:
         return surface.points(origins, directions, hits)
-    rays = origins, directions, hits
-    base = _with_stalks(kernel, surface.points, kernel.solve(*rays, np.eye(4)), *rays)
+    base = kernel.solve(origins, directions, hits, np.eye(4))
     return SurfacePoints(**base, **{name: base[fine] for name, fine in _OF_BASE.items()})  # type: ignore[arg-type]
-
-
-def _with_stalks(
-    kernel: TubeKernel, solver: PointSolver, found: Fields, origins: Array, directions: Array, hits: RayHits
-) -> Fields:
-    """Return a kernel's fields of points, those that pedunculated polyps may move solved by a surface itself."""
-    if kernel.tube.has_stalks:
-        # Both where the mesh was hit and where the bare tube was: neither alone tells of every point.
-        hit = np.flatnonzero(np.isfinite(hits.distance))
-        starts, towards = origins[hit], directions[hit]
-        near = np.zeros(len(hit), dtype=bool)
-        for distance in (hits.distance[hit], np.nan_to_num(found["distance"][hit])):
-            near |= kernel.tube.moved_by_stalks(starts + distance[:, None] * towards)
-        some = hit[near]
-        points = solver(origins[some], directions[some], hits.rows(some))
-        for name, values in found.items():
-            values[some] = getattr(points, name)
-    return found
 
 
 def _in_blocks(solver: Solver, block: int, origins: Array, directions: Array, hits: RayHits) -> Fields:
@@ -358,8 +333,7 @@ def _of_kernel(
 ) -> dict[str, Array]:
     """Return what `_of_numpy` returns, with the base's points solved by the kernel."""
     if surface.relief is None:
-        found = kernel.solve(origins, directions, hits, surface.model_from_camera)
-        return _with_stalks(kernel, partial(solve, surface), found, origins, directions, hits)
+        return kernel.solve(origins, directions, hits, surface.model_from_camera)
     # The relief is applied in the model frame, in blocks as above.
     base = vars(base_points(surface, kernel, origins, directions, hits))
     parts = []

@@ -5,8 +5,11 @@ and the curvatures of a ray stay in registers. In the orthonormal basis (T, rho,
 
     P_u = (A, r_u, 0),  P_v = (0, r_v, r),  A = 1 - psi' r cos v
     P_u x P_v = (r_u r, -A r, A r_v)
+
+The maps of pedunculated polyps are applied in the model frame.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from typing import Any
@@ -17,7 +20,16 @@ from simtest.rendering.backend import dr, mi
 from simtest.rendering.kernel_values import to_kernel, vectors_from_kernel, vectors_to_kernel
 from simtest.runtime.arrays import Array
 from simtest.surfaces import RayHits
-from simtest.surfaces.tube import MAX_SHIFT_MM, NEWTON_STEPS, NEWTON_TOLERANCE_MM, TubeChart
+from simtest.surfaces.tube import (
+    ACROSS,
+    LIFT_REACH,
+    MAX_SHIFT_MM,
+    NECK_AT,
+    NECK_REACH,
+    NEWTON_STEPS,
+    NEWTON_TOLERANCE_MM,
+    TubeChart,
+)
 
 BLOCK = 2**17
 """Rays of a launch: they bound the memory."""
@@ -33,8 +45,11 @@ _TINY = float(np.finfo(float).tiny)
 
 
 @dataclass(frozen=True)
-class _Radius:
-    """r(u, v), mm, and its derivatives at the lanes of a kernel; the second ones are 0 where not asked for."""
+class _Jet:
+    """A number or vector, and its derivatives by u and v, at the lanes of a kernel; the second ones 0 if not asked for.
+
+    What nothing uses of them Dr.Jit leaves out of the kernel.
+    """
 
     f: Any
     u: Any
@@ -42,6 +57,30 @@ class _Radius:
     uu: Any
     uv: Any
     vv: Any
+
+    def __add__(self, other: "_Jet") -> "_Jet":
+        return _Jet(*(a + b for a, b in zip(vars(self).values(), vars(other).values(), strict=True)))
+
+    def __mul__(self, other: "_Jet") -> "_Jet":
+        return self.times(other, lambda a, b: a * b)
+
+    def times(self, other: "_Jet", product: Callable[[Any, Any], Any]) -> "_Jet":
+        """Return a bilinear product of both."""
+        a, b = self, other
+        first = (product(a.u, b.f) + product(a.f, b.u), product(a.v, b.f) + product(a.f, b.v))
+        uu = product(a.uu, b.f) + 2 * product(a.u, b.u) + product(a.f, b.uu)
+        uv = product(a.uv, b.f) + product(a.u, b.v) + product(a.v, b.u) + product(a.f, b.uv)
+        vv = product(a.vv, b.f) + 2 * product(a.v, b.v) + product(a.f, b.vv)
+        return _Jet(product(a.f, b.f), *first, uu, uv, vv)
+
+    def affine(self, scale: Any, shift: Any = 0.0) -> "_Jet":
+        """Return scale times it plus a constant."""
+        return _Jet(scale * self.f + shift, *(scale * part for part in list(vars(self).values())[1:]))
+
+    def exp(self) -> "_Jet":
+        """Return the exponential of a number."""
+        e, u, v = dr.exp(self.f), self.u, self.v
+        return _Jet(e, e * u, e * v, e * (self.uu + u * u), e * (self.uv + u * v), e * (self.vv + v * v))
 
 
 @dataclass(frozen=True)
@@ -78,17 +117,18 @@ class _Table:
 
 
 class TubeKernel:
-    """Solves rays against a tube without its pedunculated polyps."""
+    """Solves rays against a tube."""
 
     def __init__(self, chart: TubeChart) -> None:
-        self.tube, numbers = chart.tube, chart.tube.numbers()
+        numbers = chart.tube.numbers()
         self._folds, self._panels = _Table(numbers.folds), _Table(numbers.panels)
-        self._waves = _Table(numbers.waves) if len(numbers.waves) else None
+        self._waves, self._stalks = (_Table(rows) if len(rows) else None for rows in (numbers.waves, numbers.stalks))
         self._corners = _Table(chart.corners.reshape(-1, 2))
         constants = {**numbers.constants, "last_knot": len(numbers.panels) - 1}
         self._n = {name: mi.Float64(value) for name, value in constants.items()}
         self._closed = chart.tube.depth > 0
-        self._counts = {"folds": mi.UInt32(len(numbers.folds)), "waves": mi.UInt32(len(numbers.waves))}
+        rows = {"folds": numbers.folds, "waves": numbers.waves, "stalks": numbers.stalks}
+        self._counts = {name: mi.UInt32(len(values)) for name, values in rows.items()}
         # Opaque, so that another colon compiles no new kernel.
         dr.make_opaque(list(self._n.values()), list(self._counts.values()))
 
@@ -131,8 +171,10 @@ class TubeKernel:
             frame = self._frame(u, v)
             r = self._radius(frame, second=False)
             along = frame.speed - frame.bend * r.f * frame.cosine
-            miss = frame.centre + r.f * frame.rho - origin - t * direction
-            pu, pv = along * frame.T + r.u * frame.rho, r.v * frame.rho + r.f * frame.tau
+            p, pu, pv = self._stalked(
+                (frame.centre + r.f * frame.rho, along * frame.T + r.u * frame.rho, r.v * frame.rho + r.f * frame.tau)
+            )
+            miss = p - origin - t * direction
             # The linear system P_u du + P_v dv - direction dt = -miss by Cramer's rule, for -du, -dv and dt
             minor = dr.cross(pv, direction)
             inverse = 1 / dr.dot(pu, minor)
@@ -168,6 +210,7 @@ class TubeKernel:
         bend, cosine, sine, gain = frame.bend, frame.cosine, frame.sine, frame.gain
         A = frame.speed - bend * r.f * cosine
         # Derivatives and normal in the basis (T, rho, tau)
+        basis = frame.T, frame.rho, frame.tau
         pu, pv = mi.Vector3d(A, r.u, 0), mi.Vector3d(0, r.v, r.f)
         puu = mi.Vector3d(
             gain - frame.twist * r.f * cosine - 2 * bend * r.u * cosine, A * bend * cosine + r.uu, -A * bend * sine
@@ -175,12 +218,19 @@ class TubeKernel:
         puv = mi.Vector3d(bend * (r.f * sine - r.v * cosine), r.uv, r.u)
         pvv = mi.Vector3d(0, r.vv - r.f, 2 * r.v)
         inward = dr.normalize(mi.Vector3d(r.u * r.f, -A * r.f, A * r.v))
+        if self._stalks is not None:
+            # In the model frame from here on
+            turned = [w.x * frame.T + w.y * frame.rho + w.z * frame.tau for w in (pu, pv, puu, puv, pvv)]
+            _, pu, pv, puu, puv, pvv = self._stalked((frame.centre + r.f * frame.rho, *turned))
+            inward = dr.normalize(dr.cross(pu, pv))
+            basis = tuple(mi.Vector3d(*row) for row in np.eye(3).tolist())
         E, F, G = dr.dot(pu, pu), dr.dot(pu, pv), dr.dot(pv, pv)
         L, M, N = (-dr.dot(inward, d) for d in (puu, puv, pvv))
         inverse = 1 / (E * G - F * F)
         duals = (G * inverse) * pu - (F * inverse) * pv, (E * inverse) * pv - (F * inverse) * pu
         # Model frame, turned to face the origin; S changes its sign with the normal.
-        normal, first, second = (w.x * frame.T + w.y * frame.rho + w.z * frame.tau for w in (inward, *duals))
+        normal, first, second = (sum((c * b for c, b in zip(w, basis, strict=True)), mi.Vector3d(0))
+                                 for w in (inward, *duals))  # fmt: skip
         sign = dr.select(dr.dot(normal, direction) > 0, mi.Float64(-1), mi.Float64(1))
         normal = normal * sign
         # Eigenvalues and eigenvectors of S in a tangent basis, S = sum of II_ij d_i d_j^T
@@ -242,7 +292,7 @@ class TubeKernel:
         first, second = -2 * squared * sine / root, -2 * squared * cosine * (3 + 2 * squared) / (root * (1 + squared))
         return middle + depth * sine, cosine, -sine / depth, (cosine * root, first / depth, second / dr.square(depth))
 
-    def _radius(self, frame: _Frame, second: bool) -> _Radius:
+    def _radius(self, frame: _Frame, second: bool) -> _Jet:
         """Compute r and its derivatives (see `Tube.radius`), of a closed tube h r."""
         n, u, v = self._n, frame.u, frame.v
         # taeniae
@@ -289,12 +339,50 @@ class TubeKernel:
                 sums[3] = h2 * r + 2 * h1 * ru * speed + h * (sums[3] * dr.square(speed) + ru * frame.gain)
                 sums[4:] = h1 * rv + h * sums[4] * speed, h * sums[5]
             sums[:3] = h * r, h1 * r + h * ru * speed, h * rv
-        return _Radius(*sums, *([] if second else [zero] * 3))
+        return _Jet(*sums, *([] if second else [zero] * 3))
+
+    def _stalked(self, wall: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Apply the maps of pedunculated polyps to points and their first, or first and second, derivatives."""
+        if self._stalks is None:
+            return wall
+        stalks, missing = self._stalks, [mi.Vector3d(0)] * (6 - len(wall))
+
+        def stalk(i: Any, *parts: Any) -> tuple[Any, ...]:
+            a, b, c, k, m, n, height, width, depth = stalks.row(i)
+            foot, axis = mi.Vector3d(a, b, c), mi.Vector3d(k, m, n)
+            start = _Jet(*parts, *missing)
+            from_foot = start.affine(1, -foot)
+            z = _Jet(*(dr.dot(axis, part) for part in vars(from_foot).values()))
+            x = from_foot + _along(z.affine(-1), axis)
+            q = x.times(x, dr.dot)
+            # lift, then stricture (see `simtest.surfaces.tube.Stalk`)
+            bent = q.affine(1 / (2 * dr.square(width)))
+            bump = (bent + bent * bent).affine(-0.5).exp()
+            raised = z + bump * _fading(z.affine(1 / (LIFT_REACH * height))).affine(height)
+            neck = _fading(raised.affine(1 / (NECK_REACH * height), -NECK_AT / NECK_REACH)).affine(-depth)
+            reach = (q * q).affine(-1 / dr.square(dr.square(width * ACROSS))).exp()
+            moved = (x + neck * reach * x + _along(raised, axis)).affine(1, foot)
+            return i + 1, *list(vars(moved).values())[: len(parts)]
+
+        names = ("i", *(f"part_{i}" for i in range(len(wall))))
+        state = (mi.UInt32(0), *(mi.Vector3d(part) for part in wall))
+        return tuple(dr.while_loop(state, lambda i, *_: i < self._counts["stalks"], stalk, labels=names)[1:])
 
     def _summed(self, term: Any, count: Any, sums: list[Any]) -> list[Any]:
         names = ("i", *(f"sum_{i}" for i in range(len(sums))))
         state = (mi.UInt32(0), *(mi.Float64(part) for part in sums))
         return list(dr.while_loop(state, lambda i, *_: i < count, term, labels=names)[1:])
+
+
+def _along(length: _Jet, axis: Any) -> _Jet:
+    """Return vectors of lengths along an axis."""
+    return _Jet(*(part * axis for part in vars(length).values()))
+
+
+def _fading(x: _Jet) -> _Jet:
+    """Return exp(-x^4)."""
+    square = x * x
+    return (square * square).affine(-1).exp()
 
 
 def _tangent_basis(normal: Any) -> tuple[Any, Any]:

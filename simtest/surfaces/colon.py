@@ -178,7 +178,7 @@ def _split(
     # Only faces with a new vertex can be cut, and those beside them.
     near = np.zeros(len(parameters), dtype=bool)
     near[faces[(faces >= fresh).any(axis=1)]] = True
-    active = near[faces].any(axis=1)
+    active: Mask = np.asarray(near[faces].any(axis=1))
     some = faces[active]
     edges, index = face_edges(some)
 
@@ -211,8 +211,9 @@ def _split(
     # Whole faces come first, in the order of all.
     whole = ~np.isin(index, chosen).any(axis=1)
     cut = halve(some, index, chosen, len(parameters), len(edges))[np.count_nonzero(whole) :]
-    active[active] = ~whole
-    return np.vstack([parameters, between(chosen)]), np.concatenate([faces[~active], cut])
+    kept = ~active
+    kept[active] = whole
+    return np.vstack([parameters, between(chosen)]), np.concatenate([faces[kept], cut])
 
 
 def _facing(positions: Array, normals: Array, faces: IntArray) -> Array:

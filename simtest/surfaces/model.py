@@ -189,7 +189,7 @@ class SurfaceModel(ABC):
 
     @property
     def chart(self) -> "TubeChart | None":
-        """What a kernel needs to solve the base's exact points as `points` does, but on stalks; None: it cannot."""
+        """What a kernel needs to solve the base's exact points as `points` does; None where it cannot."""
         return None
 
     def polyp_at(self, hits: RayHits) -> npt.NDArray[np.uint8]:

@@ -264,7 +264,7 @@ class _Fold:
 
 @dataclass(frozen=True)
 class TubeNumbers:
-    """A tube without pedunculated polyps as numbers, for a kernel."""
+    """A tube as numbers, for a kernel."""
 
     constants: dict[str, float]  # Scalars of the module's formulas
     # (K, 7) or (K, 8): along, sine and cosine of the centre, depth, 1 / width^2, slant and kappa of each fold (see
@@ -273,6 +273,7 @@ class TubeNumbers:
     waves: Array  # (W, 3): q, m and phase of the relief's waves
     # (knots, 2 + 2 * powers): x and z of each knot, then of the polynomial's coefficients about it, the lowest first
     panels: Array
+    stalks: Array  # (P, 9): foot, axis, height, width and depth of each pedunculated polyp (see `Stalk`)
 
 
 @dataclass(frozen=True)
@@ -576,7 +577,7 @@ class Tube:
         return Jet(f[back], np.stack([fu, fv], axis=1)[back], *hessian)
 
     def numbers(self) -> TubeNumbers:
-        """Return the tube as numbers, without its pedunculated polyps."""
+        """Return the tube as numbers."""
         recipe = self.recipe
         rate, omega = math.radians(recipe.bend_deg) / recipe.length_mm, 2 * math.pi / recipe.sway_length_mm
         constants = {
@@ -593,7 +594,9 @@ class Tube:
         ]
         powers = self._panels.transpose(2, 1, 0).reshape(len(self._knots), -1)
         panels = np.hstack([self._knot_points[:, [0, 2]], powers])
-        return TubeNumbers(constants, np.array(folds), np.array(self._relief).reshape(-1, 3), panels)
+        stalks = [(*s.foot, *s.axis, s.height, s.width, s.depth) for s in self._stalks.values()]
+        waves = np.array(self._relief).reshape(-1, 3)
+        return TubeNumbers(constants, np.array(folds), waves, panels, np.array(stalks).reshape(-1, 9))
 
     def frame(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return T, rho and tau, three arrays of shape (N, 3)."""

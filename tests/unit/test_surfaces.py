@@ -313,6 +313,7 @@ def test_points_have_the_normals_and_curvatures_of_differences(session, name, re
         ("colon", "bare"),
         ("colon, haustra", None),
         ("colon, closed", None),
+        ("colon, stalks", None),
         pytest.param("colon, polyps", None, marks=pytest.mark.ci),
         pytest.param("colon, tight", None, marks=pytest.mark.ci),
     ],
