@@ -264,16 +264,24 @@ def refine(session: "Session", seeds: Array, lights: IntArray, fine: bool) -> tu
     return np.concatenate(zeros), np.concatenate(of_light)
 
 
+FEW = 100
+"""Pairs of no more points are tried one by one: a tree of them takes 0.15 s to load."""
+
+
 def first_of_each(points: Array, apart: float, owners: IntArray | None = None) -> Mask:
     """Return which points, shape (N, 2), have no earlier one that stays, of the same owner, within a distance."""
     kept = [True] * len(points)
     if len(points) < 2:
         return np.array(kept, dtype=bool)
-    from scipy.spatial import cKDTree
-
     # Owners are a coordinate along which they are farther apart.
     owned = points if owners is None else np.column_stack([points, 2 * apart * owners])
-    pairs = np.sort(cKDTree(owned).query_pairs(apart, output_type="ndarray"), axis=1)
+    if len(points) <= FEW:
+        pairs = np.column_stack(np.triu_indices(len(points), 1))
+        pairs = pairs[((owned[pairs[:, 0]] - owned[pairs[:, 1]]) ** 2).sum(axis=1) <= apart**2]
+    else:
+        from scipy.spatial import cKDTree
+
+        pairs = np.sort(cKDTree(owned).query_pairs(apart, output_type="ndarray"), axis=1)
     for i, j in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].tolist():
         if kept[i]:
             kept[j] = False
