@@ -19,6 +19,7 @@ import numpy as np
 from simtest.calibration import estimate_noise
 from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.geometry import Image, Mask, smooth
+from simtest.geometry.ascent import Ascent, highest_of_pairs
 from simtest.geometry.patch import dilated, rows_and_columns
 from simtest.runtime.arrays import Array, Index
 
@@ -53,9 +54,6 @@ SADDLE_NOISE = 4.0
 RISE = 0.85
 """Clipped light is taken to rise by this power of 1 + the distance from the rim, px: so the shape of a clipped patch
 tells the highlights that have melted in it apart."""
-
-_NEIGHBOURS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
-"""The eight neighbours, row and column."""
 
 
 @dataclass(frozen=True)
@@ -221,24 +219,8 @@ def find_basins(values: Image, mask: Mask, base: Image, keep: float, noise: floa
     rows, columns = rows_and_columns(mask)
     by_height = np.argsort(values[rows, columns], kind="stable")
     rows, columns = rows[by_height], columns[by_height]
-    pixels = np.arange(len(rows))
-    # a margin of one pixel spares the borders
-    number = np.full((mask.shape[0] + 2, mask.shape[1] + 2), -1, dtype=np.int64)
-    number[rows + 1, columns + 1] = pixels
-    neighbours = [number[rows + 1 + down, columns + 1 + right] for down, right in _NEIGHBOURS]
-    # steepest ascent, and then each pixel's summit
-    up = np.maximum.reduce([pixels, *neighbours])
-    while not np.array_equal(further := up[up], up):
-        up = further
-    tops = np.flatnonzero(up == pixels)
-    tops = tops[np.argsort(by_height[tops])]
-    index = np.empty(len(rows), dtype=np.int64)
-    index[tops] = np.arange(len(tops))
-    basin = index[up]
-    # the highest saddle of each pair of basins that touch: of two neighbours the lower one is on the way
-    low = np.concatenate([np.flatnonzero(above > pixels) for above in neighbours])
-    high = np.concatenate([above[above > pixels] for above in neighbours])
-    pairs, saddle = _highest_of_pairs(basin[low], basin[high], low, len(tops))
+    ascent = Ascent.of(rows, columns, mask.shape)
+    tops, pairs, saddle = ascent.tops, ascent.pairs, ascent.saddles
     height = values[rows, columns].astype(np.float64)
     owner = _merged(tops, pairs, saddle, height, height + base[rows, columns], keep, noise)
     # summits that stay, the brightest first
@@ -248,20 +230,9 @@ def find_basins(values: Image, mask: Mask, base: Image, keep: float, noise: floa
     rank[kept] = np.arange(len(kept))
     kept_number = rank[owner]
     labels = np.zeros(values.shape, dtype=np.int64)
-    labels[rows, columns] = kept_number[basin] + 1
-    pairs, saddle = _highest_of_pairs(kept_number[pairs[:, 0]], kept_number[pairs[:, 1]], saddle, len(kept))
+    labels[rows, columns] = kept_number[ascent.basins] + 1
+    pairs, saddle = highest_of_pairs(kept_number[pairs[:, 0]], kept_number[pairs[:, 1]], saddle, len(kept))
     return Basins(rows[tops[kept]], columns[tops[kept]], labels, pairs, np.stack([rows[saddle], columns[saddle]], 1))
-
-
-def _highest_of_pairs(first: Index, second: Index, low: Index, count: int) -> tuple[Index, Index]:
-    """Return the pairs of different basins, the lower number first, and the highest of the pixels given for each."""
-    apart = first != second
-    key = np.minimum(first, second)[apart] * count + np.maximum(first, second)[apart]
-    low = low[apart]
-    ranked = np.lexsort((-low, key))
-    key, low = key[ranked], low[ranked]
-    head = np.append(True, key[1:] != key[:-1])[: len(key)]
-    return np.stack([key[head] // max(count, 1), key[head] % max(count, 1)], axis=1), low[head]
 
 
 def _merged(tops: Index, pairs: Index, saddle: Index, height: Array, total: Array, keep: float, noise: float) -> Index:

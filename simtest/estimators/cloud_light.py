@@ -13,8 +13,8 @@ Between them stand the bright spots of a frame: maxima that a saddle parts from 
 centroid. On a relief these are what can be seen of the glints (theory.md 7.1b); `cloud` groups them.
 """
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, reduce
 
 import cv2
 import numpy as np
@@ -23,9 +23,10 @@ from simtest.calibration import Frame
 from simtest.calibration.frame import median
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.geometry import Array, Image, Mask, smooth
-from simtest.geometry.patch import share_of_noise
+from simtest.geometry.ascent import Ascent
+from simtest.geometry.patch import rows_and_columns, share_of_noise
 from simtest.geometry.vectors import basis_across
-from simtest.runtime.arrays import AnyArray
+from simtest.runtime.arrays import AnyArray, Index
 
 SMOOTHING_PX = 0.7
 """Gaussian smoothing before maxima are looked for: that of a lens, so that one spot of noise is no maximum."""
@@ -147,7 +148,7 @@ def _tissue(frame: Frame) -> Image:
     Between the spots it is the diffuse light, whatever a detector split off.
     """
     gain, values = frame.corrected.gain, frame.channels
-    values = values if values.ndim == 2 else values.min(axis=2)
+    values = values if values.ndim == 2 else reduce(cv2.min, cv2.split(values))
     return smooth(values if gain is None else values * gain, SMOOTHING_PX, frame.seen)
 
 
@@ -176,19 +177,35 @@ def _background(light: Image) -> tuple[Image, Image]:
 
 def _maxima(above: Image, around: Image, brightest: float, least: float) -> Spots:
     """Find the maxima of a picture by thresholds from bright to faint: a part without a spot yet is a new one."""
-    found: list[_Spot] = []
-    level = brightest * STEP
-    while level >= least:
-        parts = cv2.connectedComponentsWithStats((above >= level).astype(np.uint8), connectivity=8)
-        _, labels, stats, centroids = parts
+    levels = [brightest * STEP]
+    while levels[-1] * STEP >= least:
+        levels.append(levels[-1] * STEP)
+    rows, columns = rows_and_columns(above >= levels[-1])
+    # Of equal pixels the first is the summit.
+    by_height = np.argsort(above[rows, columns][::-1], kind="stable")
+    rows, columns = rows[::-1][by_height], columns[::-1][by_height]
+    ascent = Ascent.of(rows, columns, above.shape)
+    count = len(ascent.tops)
+    # The first level that reaches each pixel: at each level summits appear, and pairs of them are joined.
+    reached = np.searchsorted(-np.array(levels, dtype=np.float32), -above[rows, columns])
+    born: list[list[int]] = [[] for _ in levels]
+    for summit in _in_order(ascent, reached, rows, columns).tolist():
+        born[reached[ascent.tops[summit]]].append(summit)
+    joined: list[list[list[int]]] = [[] for _ in levels]
+    for pair, number in zip(ascent.pairs.tolist(), reached[ascent.saddles].tolist(), strict=True):
+        joined[number].append(pair)
+    part, summits, found = list(range(count)), [[summit] for summit in range(count)], list[_Spot]()
+    for number, level in enumerate(levels):
+        _join(joined[number], part, summits)
         held: dict[int, list[_Spot]] = {}
         for spot in found:
-            held.setdefault(int(labels[spot.pixel[1], spot.pixel[0]]), []).append(spot)
-        for label in range(1, len(stats)):
-            own = held.get(label)
-            if own is None:
-                own = [_new_spot(above, labels, label, stats[label])]
-                found += own
+            held.setdefault(part[spot.summit], []).append(spot)
+        for summit in born[number]:
+            if part[summit] not in held:
+                top = ascent.tops[summits[part[summit]]].max()
+                found.append(_Spot(float(above[rows[top], columns[top]]), top, summit))
+                held[part[summit]] = found[-1:]
+        for label, own in held.items():
             # Fainter maxima that no saddle parts from the brightest one are none.
             for spot in own[1:]:
                 spot.absorbed = SADDLE * spot.peak < level
@@ -196,40 +213,56 @@ def _maxima(above: Image, around: Image, brightest: float, least: float) -> Spot
             for spot in apart:
                 spot.merged |= len(apart) > 1
             # Alone in its part, and not below half of its peak: these are its pixels, so far.
-            if not (spot := apart[0]).merged and (spot.point is None or level >= HIGHLIGHT_ISOVALUE * spot.peak):
-                spot.point, spot.area = centroids[label] + PIXEL_CENTRE, int(stats[label, cv2.CC_STAT_AREA])
+            if not (spot := apart[0]).merged and (not spot.size or level >= HIGHLIGHT_ISOVALUE * spot.peak):
+                # The list grows: only its start is the part of now.
+                spot.part, spot.size, spot.level = summits[label], len(summits[label]), number
         found = [spot for spot in found if not spot.absorbed]
-        level *= STEP
-    kept = [
-        spot
-        for spot in found
-        if spot.area >= LEAST_PX and spot.peak >= LEAST_CONTRAST * around[spot.pixel[1], spot.pixel[0]]
-    ]
-    kept.sort(key=lambda spot: -spot.peak)
-    points = np.array([spot.point for spot in kept]).reshape(-1, 2)
-    return Spots(points, np.array([float(spot.area) for spot in kept]), np.array([spot.peak for spot in kept]))
+    # Number of each summit's pixels down to each level, and sums of their columns and rows.
+    size = count, len(levels)
+    cell = ascent.basins * len(levels) + reached
+    sums = [np.bincount(cell, each, count * len(levels)).reshape(size).cumsum(1) for each in (None, columns, rows)]
+    of = [[float(each[spot.part[: spot.size], spot.level].sum()) for each in sums] for spot in found]
+    bright = [spot.peak >= LEAST_CONTRAST * around[rows[spot.top], columns[spot.top]] for spot in found]
+    kept = [i for i, spot in enumerate(found) if of[i][0] >= LEAST_PX and bright[i]]
+    kept.sort(key=lambda i: -found[i].peak)
+    areas, *middles = np.array([of[i] for i in kept]).reshape(-1, 3).T
+    points = np.stack(middles, axis=1) / areas[:, None] + PIXEL_CENTRE
+    return Spots(points, areas, np.array([found[i].peak for i in kept]))
 
 
-def _new_spot(above: Image, labels: Array, label: int, stats: Array) -> "_Spot":
-    """Return the spot of a part of a picture that holds none yet; `stats` are the part's."""
-    x, y, width, height = (int(v) for v in stats[:4])
-    inside = labels[y : y + height, x : x + width] == label
-    values = np.where(inside, above[y : y + height, x : x + width], -np.inf)
-    row, column = np.unravel_index(int(values.argmax()), values.shape)
-    return _Spot(float(values[row, column]), (x + int(column), y + int(row)))
+def _join(pairs: list[list[int]], part: list[int], summits: list[list[int]]) -> None:
+    """Join the parts of pairs of summits: each summit's part, and each part's summits."""
+    for one, other in pairs:
+        small, large = sorted((part[one], part[other]), key=lambda each: len(summits[each]))
+        if small != large:
+            summits[large] += summits[small]
+            for summit in summits[small]:
+                part[summit] = large
+
+
+def _in_order(ascent: Ascent, reached: Index, rows: Index, columns: Index) -> Index:
+    """Return the summits in the order of the first square of 2 x 2 pixels that is reached with each."""
+    with_top = reached == reached[ascent.tops][ascent.basins]
+    square = (rows // 2 * (columns.max(initial=0) + 1) + columns // 2)[with_top]
+    first = np.full(len(ascent.tops), square.max(initial=0))
+    np.minimum.at(first, ascent.basins[with_top], square)
+    return np.argsort(first, kind="stable")
 
 
 @dataclass
 class _Spot:
-    """A spot that is being found: its peak and its pixel, its pixels' centroid and number so far.
+    """A spot that is being found: its peak, that one's pixel and summit, and its part of the picture so far.
 
-    `merged` once its part holds another one, `absorbed` where no saddle parts it from a brighter one.
+    That are the first `size` summits of `part`, down to a level. `merged` once its part holds another one, `absorbed`
+    where no saddle parts it from a brighter one.
     """
 
     peak: float
-    pixel: tuple[int, int]
-    point: Array | None = None
-    area: int = 0
+    top: int
+    summit: int
+    part: list[int] = field(default_factory=list)
+    size: int = 0
+    level: int = 0
     merged: bool = False
     absorbed: bool = False
 
@@ -354,23 +387,28 @@ def _fitted(points: Array, radius2: Array, values: Array, hues: Array) -> Shadin
     scale = float(np.sqrt((points**2).mean()))
     x, y = points.T / scale
     terms = [np.ones_like(x), x, y, x**2 / 2, x * y, y**2 / 2]
-    A = np.column_stack([*terms, hues - hues.mean(axis=0)])
+    A = np.column_stack([*terms, hues - hues.mean(axis=0), values])
     near = np.exp(-radius2 / 4)
     weights = near
     for _ in range(STEPS):
-        solution = _solved(A, weights, values)
-        gaps = values - A @ solution
+        solution = _solved(_products(A, weights))
+        gaps = values - A[:, :-1] @ solution
         spread = 1.48 * float(median(np.abs(gaps))) + 1e-9
         weights = near / (1 + (gaps / (OUTLYING * spread)) ** 2)
     sector = ((np.arctan2(y, x) / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
-    without = [_solved(A[sector != i], weights[sector != i], values[sector != i]) for i in range(SECTORS)]
+    own = np.stack([_products(A[sector == i], weights[sector == i]) for i in range(SECTORS)])
+    without = [_solved(products) for products in own.sum(axis=0) - own]
     moves = (np.array(without) - solution)[:, 1:3] / scale
     return Shading(solution[1:3] / scale, moves.T @ moves * (SECTORS - 1) / SECTORS, _gains(solution[3:6] / scale**2))
 
 
-def _solved(A: Array, weights: Array, values: Array) -> Array:
-    weighted = (A * weights[:, None]).T
-    return np.asarray(np.linalg.lstsq(weighted @ A, weighted @ values, rcond=None)[0])
+def _products(A: Array, weights: Array) -> Array:
+    """Return the weighted products of columns, shape (K, K), the last of which is fitted by the others."""
+    return np.asarray((A * weights[:, None]).T @ A)
+
+
+def _solved(products: Array) -> Array:
+    return np.asarray(np.linalg.lstsq(products[:-1, :-1], products[:-1, -1], rcond=None)[0])
 
 
 def _gains(hessian: Array) -> Array:

@@ -438,9 +438,6 @@ def find_spots(light: Image, specular: Image, seen: Mask | None = None) -> Visib
     `light` is the radiance behind the lens, `specular` the part that comes directly off the lobe, both of shape (H, W),
     `seen` the pixels inside the view mask, default all.
     """
-    from skimage.measure import label
-    from skimage.segmentation import watershed
-
     light = np.where(np.isfinite(light), light, 0.0).astype(np.float64)
     if seen is not None:
         # The lens spreads light over the border of the view.
@@ -461,17 +458,34 @@ def find_spots(light: Image, specular: Image, seen: Mask | None = None) -> Visib
         return empty
     rows, columns = np.unravel_index(peaks, light.shape)
     # Pixels: above half of the lobe's peak, shared out by watershed, connected to the peak.
-    markers = np.zeros(light.shape, dtype=np.int32)
-    markers[rows, columns] = np.arange(1, len(peaks) + 1)
-    half = specular[rows, columns] / 2
-    owners = watershed(-specular, markers, mask=specular >= half.min())
-    owners[specular < np.concatenate([[np.inf], half])[owners]] = 0
-    pieces = label(owners, background=0, connectivity=1)
+    pieces = _pieces(specular, rows, columns)
     # A component keeps its number only if it holds its own peak.
     held = np.zeros(pieces.max() + 1, dtype=np.int64)
     held[pieces[rows, columns]] = np.arange(1, len(peaks) + 1)
     held[0] = 0
     return VisibleSpots(np.asarray(rows), np.asarray(columns), held[pieces])
+
+
+def _pieces(specular: Image, rows: IntArray, columns: IntArray) -> npt.NDArray[np.int32]:
+    """Return the number of the connected piece of one peak's pixels that each pixel is in, shape (H, W); 0: in none."""
+    half = specular[rows, columns] / 2
+    parts = connected(specular >= half.min())
+    own, numbers = parts[rows, columns], np.arange(1, len(rows) + 1)
+    alone = len(np.unique(own)) == len(own)
+    if alone:
+        owner_of = np.zeros(parts.max() + 1, dtype=np.int64)
+        owner_of[own] = numbers
+        owners = owner_of[parts]
+    else:
+        # Here, where it is needed: slow to load.
+        from skimage.measure import label
+        from skimage.segmentation import watershed
+
+        markers = np.zeros(parts.shape, dtype=np.int32)
+        markers[rows, columns] = numbers
+        owners = watershed(-specular, markers, mask=parts > 0)
+    owners[specular < np.concatenate([[np.inf], half])[owners]] = 0
+    return connected(owners > 0) if alone else np.asarray(label(owners, background=0, connectivity=1), dtype=np.int32)
 
 
 def _stands_out(light: Image, log: Image, row: int, column: int) -> bool:
@@ -492,20 +506,23 @@ def _stands_out(light: Image, log: Image, row: int, column: int) -> bool:
         half *= 2
 
 
+_BESIDE = ((0, 0), (0, -1), (-1, 0), (1, 0), (0, 1))
+"""A pixel and its neighbours along the axes, row and column, in the order in which their spots take a glint."""
+
+
 def glints_of(spots: VisibleSpots, glints: list[TrueHighlight]) -> list[tuple[int, ...]]:
     """Return which lit glints, by index, each spot holds, or has next to its pixels."""
-    from skimage.segmentation import expand_labels
-
     held: list[list[int]] = [[] for _ in spots.rows]
     if not len(spots.rows):
         return []
     # A glint lies up to a pixel beside the light that it makes.
-    around = expand_labels(spots.regions, distance=1)
-    height, width = around.shape
+    around = np.pad(spots.regions, 1)
+    height, width = spots.regions.shape
     for number, glint in enumerate(glints):
-        column, row = min(int(glint.bp_px[0]), width - 1), min(int(glint.bp_px[1]), height - 1)
-        if glint.lit and around[row, column]:
-            held[around[row, column] - 1].append(number)
+        column, row = min(int(glint.bp_px[0]), width - 1) + 1, min(int(glint.bp_px[1]), height - 1) + 1
+        near = (around[row + down, column + right] for down, right in _BESIDE)
+        if glint.lit and (region := next(filter(None, near), 0)):
+            held[region - 1].append(number)
     return [tuple(numbers) for numbers in held]
 
 

@@ -3,7 +3,7 @@
 import itertools
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -162,7 +162,7 @@ def make_cases(jobs: Sequence[Job], engine: Engine, progress: "Progress | None")
     waiting = Counter(cases)
     made: dict[CaseOf, dict[int, pl.DataFrame]] = {case: {} for case in waiting}
     # Parts come back in any order; a case is kept once all its parts are there.
-    for number, rows in engine.run(make_rows, parts, bar.step):
+    for number, rows in _run(engine, parts, bar.step):
         case = cases[number]
         made[case][number] = rows
         if len(made[case]) == waiting[case]:
@@ -172,6 +172,16 @@ def make_cases(jobs: Sequence[Job], engine: Engine, progress: "Progress | None")
     forget()
     bar.end()
     return {job.folder: len(job.cases) - len(missing[job.folder]) for job in jobs}
+
+
+def _run(engine: Engine, parts: Sequence[Part], on_step: OnStep) -> Iterator[tuple[int, pl.DataFrame]]:
+    """Yield the number and the rows of each part; a variant has its own processes: memory of the last one is freed."""
+    first = 0
+    for _, group in itertools.groupby(parts, key=lambda part: part.variant):
+        own = list(group)
+        for number, rows in engine.run(make_rows, own, on_step):
+            yield first + number, rows
+        first += len(own)
 
 
 def by_variant(jobs: Sequence[Job]) -> list[Job]:

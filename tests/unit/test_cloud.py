@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Frame, Priors, Response, Uniform, exactly
 from simtest.errors import Failure, Reason
+from simtest.estimators import cloud_light
 from simtest.estimators.cloud import CloudCentre, cloud, small_sample
 from simtest.estimators.cloud_light import find_spots
 from simtest.estimators.cloud_mixture import fit_mixture, sampling_covariance, window_of
@@ -73,6 +74,46 @@ def test_a_saddle_parts_two_spots_and_a_shoulder_does_not():
     for apart, count in ((8.0, 2), (3.0, 1)):
         found = find_spots(frame_of(picture_of([(100.3, 80.0), (100.3 + apart, 80.0)])))
         assert len(found.points_px) == count
+
+
+def labelled_maxima(above, around, brightest, least):
+    """Peak, area and centroid of each spot, slowly: the parts above each threshold are labelled anew."""
+    spots, level = [], brightest * cloud_light.STEP
+    while level >= least:
+        _, labels, stats, centroids = cv2.connectedComponentsWithStats((above >= level).astype(np.uint8))
+        for label in range(1, len(stats)):
+            own = [spot for spot in spots if labels[spot["pixel"]] == label]
+            if not own:
+                pixel = np.unravel_index(np.where(labels == label, above, -1).argmax(), above.shape)
+                own = [{"pixel": pixel, "peak": float(above[pixel]), "area": 0, "merged": False}]
+                spots += own
+            for spot in own[1:]:
+                if cloud_light.SADDLE * spot["peak"] < level:
+                    own = [other for other in own if other is not spot]
+                    spots = [other for other in spots if other is not spot]
+            for spot in own:
+                spot["merged"] |= len(own) > 1
+            if not own[0]["merged"] and (not own[0]["area"] or level >= own[0]["peak"] / 2):
+                own[0] |= {"area": int(stats[label, cv2.CC_STAT_AREA]), "point": centroids[label] + 0.5}
+        level *= cloud_light.STEP
+    faintest = cloud_light.LEAST_CONTRAST * around
+    kept = [spot for spot in spots if spot["area"] >= 3 and spot["peak"] >= faintest[spot["pixel"]]]
+    kept.sort(key=lambda spot: -spot["peak"])
+    return [(spot["peak"], spot["area"], *spot["point"]) for spot in kept]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.booleans())
+def test_spots_are_the_maxima_that_labels_at_each_threshold_find(seed, steps):
+    rng = np.random.default_rng(seed)
+    above = cv2.GaussianBlur(rng.random((60, 80)).astype(np.float32), (0, 0), 1.5)
+    above = (above - above.min()) / (above.max() - above.min()) * (rng.random(above.shape) > 0.05).astype(np.float32)
+    above = np.round(above * 12) / np.float32(12) if steps else above
+    around = np.full(above.shape, np.float32(1.2))
+    spots = cloud_light._maxima(above, around, float(above.max()), 0.2)
+    found = zip(spots.peaks.tolist(), spots.areas_px.tolist(), *spots.points_px.T.tolist(), strict=True)
+    assert list(found) == labelled_maxima(above, around, float(above.max()), 0.2)
+    assert len(spots.peaks) > 10
 
 
 def test_texture_of_tissue_is_no_spot():
