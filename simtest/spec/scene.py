@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
 from simtest.calibration.photometry import AngularProfile
-from simtest.calibration.priors import NO_FLOORS, UNTOLD_FALLOFF_POWER
+from simtest.calibration.priors import NO_FLOORS, OF_PICTURES, UNTOLD_FALLOFF_POWER, Floors
 from simtest.errors import InputError
 from simtest.runtime.arrays import short_repr
 from simtest.runtime.boundary import plain_errors
@@ -224,7 +224,8 @@ class Scene(Spec):
             None if mean is None else Normal(mean, mean * self.known.distance_sd),
             None if curvature is None else exactly(curvature),
             falloff_power=None if told else UNTOLD_FALLOFF_POWER,
-            floors=NO_FLOORS,
+            # On relief any highlight may be a near miss, however few there are.
+            floors=NO_FLOORS if self.surface.relief is None else Floors(near_miss_sd=OF_PICTURES.near_miss_sd),
         )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, CameraPrior, LogUniform, Normal, Priors, Uniform, exactly
-from simtest.calibration.priors import NO_FLOORS
+from simtest.calibration.priors import NO_FLOORS, OF_PICTURES, Floors
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.bisector import bisector
@@ -138,6 +138,9 @@ def test_a_scene_says_it():
     assert (priors.lights_mm, priors.lobe_curvature) == (((0.0, 0.0, 0.0),), exactly(200.0))
     silent = scene_from_dict({"surface": surface, "known": {"lights": False, "lobe": False}})
     assert silent.calibration(10.0).priors == Priors(falloff_power=None, floors=NO_FLOORS)
+    # Few highlights of a relief may be near misses as in a picture; a smooth wall shows none.
+    rough = scene_from_dict({"surface": surface | {"relief": {"bands": [{"slope_deg": 4.0, "wavelength_mm": 1.0}]}}})
+    assert rough.calibration().priors.floors == Floors(near_miss_sd=OF_PICTURES.near_miss_sd)
     unknown = scene_from_dict({"surface": surface, "sensor": {"vignetting_known": False}})
     assert unknown.calibration().priors.falloff_power == Priors().falloff_power
     with pytest.raises(InputError, match="exclude each other"):
