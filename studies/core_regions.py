@@ -12,8 +12,9 @@ answers stay in FOLDER, and a stopped study goes on. Printed are
    over the reported deviation;
 2. the share of shifted frames, and of sets of them, that the check on shift finds, and the coverage there without and
    with it;
-3. for estimators that report a covariance, the factor between the deviation that the errors show and the reported one:
-   the 95 % quantile of the error over the reported deviation, over what that is for a round covariance, 1.73.
+3. for estimators that report a covariance, on frames of the calibration, fresh ones and those of another organ, the
+   factor between the deviation that the errors show and the reported one: the 95 % quantile of the error over the
+   reported deviation, over what that is for a round covariance, 1.73.
 """
 
 import argparse
@@ -49,6 +50,7 @@ MOVED_MM, QUALITY = 1.0, 40
 SETS = (LEAST_SET, SET_FRAMES)
 STEEPER, GROOVES = 1.5, "surface.relief.bands.1.slope_deg"
 """Twice would be a relief that is not allowed to the recipe's longest wavelengths; most of the slope is theirs."""
+FACTORS, LEAST_OF_FACTOR = ("calibration", "fresh", "other organ"), 20
 ROUND = 1.7308
 """The 95 % quantile of the length of a round normal pair over the root of its covariance's trace."""
 
@@ -203,10 +205,9 @@ def print_study(frames: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
                     without, with_it = (covered(judged(strata, moved, off), 1) for off in (None, away[kind]))
                     shifted.append((core, target, kind, str(len(moved["error_deg"])), without, with_it))
             if np.all(sigma > 0):
-                factors += [
-                    (core, target, text_of(part), str(part.highlights), f"{quantile_ratio(held, part) / ROUND:.2f}")
-                    for part in strata.parts
-                ]
+                on = [held, *(answers(frames.get(kind, ()), core, target) for kind in FACTORS[1:])]
+                factors += [(core, target, text_of(part), str(part.highlights), *(factor(each, part) for each in on))
+                            for part in strata.parts]  # fmt: skip
     heads = ("core", "normal", "answers, calibration / fresh", "scale", "strata", "68 %", "95 %", "least of a stratum",
              "median radius (deg)", "score / one radius", "error / deviation alone")  # fmt: skip
     print_markdown([heads, *first])
@@ -215,7 +216,7 @@ def print_study(frames: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
              for kind, own in away.items() if kind != "calibration"]  # fmt: skip
     print_markdown([("frames", "in all", "found by the check (%)", *(f"{n} together (%)" for n in SETS)), *found])
     print_markdown([("core", "normal", "shift", "answers", "95 % without the check", "with it"), *shifted])
-    print_markdown([("core", "normal", "stratum", "answers", "factor"), *factors])
+    print_markdown([("core", "normal", "stratum", "answers", *(f"factor, {kind}" for kind in FACTORS)), *factors])
 
 
 def together(shift: Shift, frames: Sequence[Mapping[str, Any]], count: int) -> str:
@@ -227,12 +228,13 @@ def together(shift: Shift, frames: Sequence[Mapping[str, Any]], count: int) -> s
     return f"{100 * np.mean([shift.set_distance(each) > shift.set_limit for each in sets]):.0f}"
 
 
-def quantile_ratio(held: Mapping[str, Array], part: Stratum) -> float:
-    """Return the 95 % quantile of errors over reported deviations in a stratum."""
+def factor(held: Mapping[str, Array], part: Stratum) -> str:
+    """Return by what reported deviations in a stratum are too small; nothing of fewer than `LEAST_OF_FACTOR` frames."""
     own = np.ones(len(held["error_deg"]), bool)
     for name, (low, high) in part.ends.items():
         own &= (held[name] >= (-np.inf if low is None else low)) & (held[name] < (np.inf if high is None else high))
-    return quantile(held["error_deg"][own] / held["sigma_deg"][own], held["frame"][own].astype(int), 0.95)
+    ratios, of = held["error_deg"][own] / held["sigma_deg"][own], held["frame"][own].astype(int)
+    return f"{quantile(ratios, of, 0.95) / ROUND:.2f}" if len(np.unique(of)) >= LEAST_OF_FACTOR else "–"
 
 
 def holm(chances: Sequence[tuple[float, str, str, str]], level: float = 0.01) -> str:

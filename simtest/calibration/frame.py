@@ -258,10 +258,11 @@ class Frame:
                 self.smoothed, box, peak, saturated=self.corrected.saturated, seen=self.seen,
                 raw=self.corrected.intensity, noise=self.noise_as_smoothed, smoothing_px=self.smoothing_px,
             )  # fmt: skip
-            if self.light is not None and isinstance(cut, Patch):
+            if isinstance(cut, Patch) and (self.light is not None or self.encoded.ndim == 3):
                 x, y, width, height = box
                 crop, gain = np.s_[y : y + height, x : x + width], self.corrected.gain
-                left = self.channels[crop].reshape(height, width, -1).max(axis=2) - self.light[crop]
+                light = self.corrected.linear if self.light is None else self.light
+                left = self.channels[crop].reshape(height, width, -1).max(axis=2) - light[crop]
                 left = left if gain is None else left * gain[crop]
                 cut = replace(cut, diffuse=max(float(median(left.ravel())), 0.0))
             self._patches[box, peak] = cut

@@ -223,7 +223,7 @@ class CameraPrior:
 
 @dataclass(frozen=True)
 class Floors:
-    """What is left open of a picture however well it is calibrated; the default is nothing, as of a render.
+    """What is left open of a picture however well it is calibrated; the default is nothing, as of a smooth render.
 
     Parameters
     ----------

@@ -110,8 +110,8 @@ def near_miss_variance(patch: Patch, lights: int, of_few: float = 0.0) -> float:
     Where a surface is rough or folded, a bright spot need not hold a point at which the normal bisects the directions
     to light and camera: a minimum of the misfit tau above 0 shines too (theory.md 7.1b). Such a near miss looks like
     any other spot, and the estimate is off by abs(tau) in an unknown direction. What the picture tells is its
-    contrast c to the body's diffuse light: with a Gaussian lobe of standard deviation s it is c0 exp(-tau^2 / (2 s^2)),
-    and since a wide lobe spreads the same light over a larger angle, c0 = E / s^2. The miss
+    contrast c to the strongest channel of the body's diffuse light: with a Gaussian lobe of standard deviation s it is
+    c0 exp(-tau^2 / (2 s^2)), and since a wide lobe spreads the same light over a larger angle, c0 = E / s^2. The miss
 
         tau^2 = 2 s^2 ln(E / (s^2 c))
 

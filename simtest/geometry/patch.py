@@ -76,8 +76,8 @@ class Patch:
     others_value : tuple of float
         Smoothed intensities of those, 0 where one has no patch; empty: not known.
     diffuse : float
-        The body's light beside the highlight that is not in `values`: that of its strongest channel, where these are
-        the specular part of a colour frame.
+        The body's light beside the highlight that is not in `values`: what its strongest channel has more, where these
+        are the mean of a colour frame's channels, or all of it, where they are the specular part.
     clipped_share : float
         Share of the frame's highlights that are clipped.
     score : float, optional

@@ -1,5 +1,6 @@
 """The scene: surface, reflectance, rig, camera, sensor and rendering effort."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from pydantic import Field, model_validator
 
 from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
 from simtest.calibration.photometry import AngularProfile
-from simtest.calibration.priors import NO_FLOORS, UNTOLD_FALLOFF_POWER
+from simtest.calibration.priors import NO_FLOORS, OF_PICTURES, UNTOLD_FALLOFF_POWER, Floors
 from simtest.errors import InputError
 from simtest.runtime.arrays import short_repr
 from simtest.runtime.boundary import plain_errors
@@ -219,12 +220,15 @@ class Scene(Spec):
         # A falloff that they are not told is still in the frame.
         emitted = self.rig.known_emission() is not None or all(light.is_isotropic for light in self.rig.lights)
         told = self.sensor.vignetting_known and self.rig.emission_known and emitted
+        # On a relief as steep as near misses are off any highlight may be one, however few there are.
+        relief = self.surface.relief
+        steep = relief is not None and math.radians(relief.slope_deg) > OF_PICTURES.near_miss_sd
         return Priors(
             tuple(light.nominal_mm for light in self.rig.lights) if self.known.lights else (),
             None if mean is None else Normal(mean, mean * self.known.distance_sd),
             None if curvature is None else exactly(curvature),
             falloff_power=None if told else UNTOLD_FALLOFF_POWER,
-            floors=NO_FLOORS,
+            floors=Floors(near_miss_sd=OF_PICTURES.near_miss_sd) if steep else NO_FLOORS,
         )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, CameraPrior, LogUniform, Normal, Priors, Uniform, exactly
-from simtest.calibration.priors import NO_FLOORS
+from simtest.calibration.priors import NO_FLOORS, OF_PICTURES, Floors
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.bisector import bisector
@@ -138,6 +138,11 @@ def test_a_scene_says_it():
     assert (priors.lights_mm, priors.lobe_curvature) == (((0.0, 0.0, 0.0),), exactly(200.0))
     silent = scene_from_dict({"surface": surface, "known": {"lights": False, "lobe": False}})
     assert silent.calibration(10.0).priors == Priors(falloff_power=None, floors=NO_FLOORS)
+    # Few highlights of a steep relief may be near misses as in a picture; a gentle one shows none.
+    for slope, floors in ((2.0, NO_FLOORS), (4.0, Floors(near_miss_sd=OF_PICTURES.near_miss_sd))):
+        relief = {"bands": [{"slope_deg": slope, "wavelength_mm": 1.0}]}
+        rough = scene_from_dict({"surface": {**surface, "relief": relief}})
+        assert rough.calibration().priors.floors == floors
     unknown = scene_from_dict({"surface": surface, "sensor": {"vignetting_known": False}})
     assert unknown.calibration().priors.falloff_power == Priors().falloff_power
     with pytest.raises(InputError, match="exclude each other"):

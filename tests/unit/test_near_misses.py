@@ -8,7 +8,7 @@ import pytest
 
 from simtest.advice.twin.scoring import score
 from simtest.calibration import LIGHT_AT_CAMERA, NO_PRIORS, Calibration, exactly, srgb_encode
-from simtest.calibration.priors import Floors
+from simtest.calibration.priors import NO_FLOORS, Floors
 from simtest.errors import Failure, Reason
 from simtest.estimators import load_estimators
 from simtest.estimators.prior_parts import CROWD, DARK, LEAST, NARROWER, SEVERAL, SPREAD_PX, WIDEST, near_miss_variance
@@ -161,6 +161,24 @@ def test_a_region_of_interest_is_as_uncertain_as_in_the_whole_frame():
     assert spot.patch.others_px == alone.patch.others_px == ()
 
 
+def test_the_contrast_is_to_the_strongest_channel_by_either_detector():
+    # A liver's red, of which the mean of the channels shows less than half.
+    lobes = np.clip(crowd()[..., None] - 0.05, 0, None)
+    picture = np.rint(255 * srgb_encode(np.clip(0.3 * np.array([1.0, 0.2, 0.17]) + 0.6 * lobes, 0, 1))).astype(np.uint8)
+    camera = Camera.from_fov(60.0, 320, 240)
+    told = {"detector": "peaks", "smoothing_px": 1.0}
+    found = (
+        reconstruct(picture, camera, ["cone_axis"]),
+        reconstruct(picture, camera, ["cone_axis"], **told),
+        reconstruct(picture.mean(axis=2).astype(np.uint8), camera, ["cone_axis"], **told),
+    )
+    assert [len(each) for each in found] == [9, 9, 9]
+    by_colour, by_peaks, grey = (np.mean([near_miss_variance(spot.patch, 1) for spot in each]) for each in found)
+    assert by_peaks == pytest.approx(by_colour, rel=0.15)
+    # Negative control: without colours nobody sees the channel, and the mean is the body's light.
+    assert grey < 0.7 * by_peaks
+
+
 def test_a_region_of_noise_alone_has_no_answer():
     known = Calibration(Camera.from_fov(60.0, 160, 120), priors=LIGHT_AT_CAMERA)
     y, x = np.mgrid[:120, :160] + 0.5
@@ -218,13 +236,13 @@ def test_the_regions_hold_on_rendered_rough_tissue_and_not_without_the_part(monk
     view = render_view(session, scene)
     picture = np.asarray(np.rint(255 * view.frame(1)) / 255, dtype=np.float32)
 
-    def shares():
-        found = run(picture, view.calibration, Options(least_score=0))
+    def shares(calibration):
+        found = run(picture, calibration, Options(least_score=0))
         scored = [spot for spot in score(session, view, found) if spot.held is not None]
         near = [spot.kind == "near_miss" for spot in scored]
         return found, len(scored), np.mean(near), np.mean([spot.held for spot in scored])
 
-    whole, count, near, held = shares()
+    whole, count, near, held = shares(view.calibration)
     assert count >= 100
     assert near > 0.2
     assert held > 0.88
@@ -243,6 +261,8 @@ def test_the_regions_hold_on_rendered_rough_tissue_and_not_without_the_part(monk
         spot.held for spot in score(session, view, Specularities(cut, boxes, whole.choices)) if spot.held is not None
     ]
     assert np.mean(scored) > 0.85
-    # Negative control: no frame is crowded.
+    # Negative control: no frame is crowded, and nobody told of a relief.
     monkeypatch.setattr("simtest.estimators.prior_parts.CROWD", math.inf)
-    assert shares()[3] < 0.75
+    assert shares(view.calibration)[3] > 0.88
+    untold = replace(view.calibration, priors=replace(view.calibration.priors, floors=NO_FLOORS))
+    assert shares(untold)[3] < 0.75
