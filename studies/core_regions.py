@@ -33,7 +33,17 @@ from simtest.advice.plan import DISTANCES, Question
 from simtest.advice.scope import read_scope
 from simtest.dataset.scoring.frames import CaseFrames, RenderedFrame
 from simtest.estimators import load_estimators
-from simtest.reconstruction.regions import LEAST_SET, SET_FRAMES, Shift, Strata, Stratum
+from simtest.estimators.protocol import Target
+from simtest.reconstruction.regions import (
+    LEAST_SET,
+    OF_ANSWER,
+    OF_FRAME,
+    SET_FRAMES,
+    Feature,
+    Shift,
+    Strata,
+    Stratum,
+)
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import write_json
 from simtest.runtime.processes import OnStep, make_engine
@@ -52,7 +62,7 @@ STEEPER, GROOVES = 1.5, "surface.relief.bands.1.slope_deg"
 ROUND = 1.7308
 """The 95 % quantile of the length of a round normal pair over the root of its covariance's trace."""
 
-Answer = dict[str, Any]
+TARGETS: tuple[Target, ...] = ("fine", "base")
 
 
 @dataclass(frozen=True)
@@ -122,20 +132,21 @@ class Judged:
     stratum: Array
 
 
-def answers(frames: Sequence[Mapping[str, Any]], core: str, target: str) -> dict[str, Array]:
-    """Return a core's answers, by feature, with the number of the frame."""
-    own = [(i, each) for i, frame in enumerate(frames) for each in frame["answers"]
-           if (each["estimator"], each["target"]) == (core, target)]  # fmt: skip
-    names = (*core_calibration.ORDER, "error_deg")
-    return {name: np.array([each[name] for _, each in own], float) for name in names} | {
-        "frame": np.array([i for i, _ in own], int)
-    }
+def answers(frames: Sequence[Mapping[str, Any]], core: str, target: Target) -> dict[str, Array]:
+    """Return a core's answers, by feature, with their errors and the number of the frame."""
+    seen, error_deg, of = core_calibration.answers_of(frames, target, core)
+    return {**seen, "error_deg": error_deg, "frame": of}
+
+
+def features(held: Mapping[str, Array]) -> dict[Feature, Array]:
+    """Return the features alone."""
+    return {name: held[name] for name in (*OF_ANSWER, *OF_FRAME)}
 
 
 def judged(strata: Strata, held: Mapping[str, Array], outside: Array | None = None) -> Judged:
     """Return the regions of answers; `outside`: by frame, whether the check on shift finds it."""
     count = len(held["error_deg"])
-    seen = [{name: float(held[name][i]) for name in core_calibration.ORDER} for i in range(count)]
+    seen = [{name: float(values[i]) for name, values in features(held).items()} for i in range(count)]
     away = np.zeros(count, bool) if outside is None else outside[held["frame"]]
     radii = np.array([strata.region(each, bool(off)) for each, off in zip(seen, away, strict=True)]).T
     stratum = np.array([next(n for n, part in enumerate(strata.parts) if part.holds(each)) for each in seen])
@@ -174,12 +185,12 @@ def print_study(frames: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
             for kind, own in frames.items()}  # fmt: skip
     first, shifted, factors, chances = [], [], [], []
     for core in dict.fromkeys(each["estimator"] for frame in known for each in frame["answers"]):
-        for target in ("fine", "base"):
+        for target in TARGETS:
             held = answers(known, core, target)
             if not len(held["error_deg"]) or len(np.unique(held["frame"])) < 40:
                 continue
             error, sigma, of = held["error_deg"], held["sigma_deg"], held["frame"].astype(int)
-            strata = strata_of({name: held[name] for name in core_calibration.ORDER}, error, of)
+            strata = strata_of(features(held), error, of)
             met = judged(strata, answers(fresh, core, target))
             one = interval_scores(np.array(quantile(error, of, 0.95)), met.error_deg).mean()
             score = interval_scores(met.radii_deg[1], met.error_deg).mean() / one

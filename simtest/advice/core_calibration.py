@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -115,6 +116,19 @@ def kept_frame(frame: RenderedFrame, estimators: Mapping[str, AnyEstimator], det
     return {"statistics": numbers, "answers": answers}
 
 
+def answers_of(
+    frames: Sequence[Mapping[str, Any]], target: Target, core: str | None = None
+) -> tuple[dict[Feature, Array], Array, IntArray]:
+    """Return features, errors, deg, and numbers of the frames of kept answers, by default of all cores, shape (N,)."""
+    own = [(i, each) for i, frame in enumerate(frames) for each in frame["answers"]
+           if each["target"] == target and core in (None, each["estimator"])]  # fmt: skip
+    told = [regions.of_frame(None if (each := frame["statistics"]) is None else np.array(each, float))
+            for frame in frames]  # fmt: skip
+    seen = {name: np.array([each[name] for _, each in own], float) for name in regions.OF_ANSWER}
+    seen |= {name: np.array([told[i][name] for i, _ in own], float) for name in regions.OF_FRAME}
+    return seen, np.array([each["error_deg"] for _, each in own], float), np.array([i for i, _ in own], int)
+
+
 # Strata ---------------------------------------------------------------------------------------------------------------
 
 
@@ -170,12 +184,16 @@ def expected_of(seen: Mapping[Feature, Array], error_deg: Array, frames: IntArra
     rows, (_, which, counts) = regions.regressors(seen), np.unique(frames, return_inverse=True, return_counts=True)
     weights = 1 / np.sqrt(counts[which])
     weights /= weights.sum()
-    target = np.log(error_deg + np.median(error_deg))
-    centre, spread, start = weights @ rows, rows.std(axis=0) + 1e-9, float(weights @ target)
-    scaled = np.clip((rows - centre) / spread, -3, 3)
+    target, told = np.log(error_deg + np.median(error_deg)), np.isfinite(rows)
+    start, known = float(weights @ target), np.maximum(weights @ told, 1e-9)
+    centre = weights @ np.where(told, rows, 0.0) / known
+    off = np.where(told, rows - centre, 0.0)
+    spread = np.sqrt((off**2).sum(axis=0) / np.maximum(told.sum(axis=0), 1)) + 1e-9
+    found = Expected(centre=tuple(centre), spread=tuple(spread), weights=(0.0,) * len(centre), start=start)
+    scaled = found.scaled(rows)
     normal = (scaled.T * weights) @ scaled + RIDGE * np.eye(regions.REGRESSORS)
-    found = np.linalg.solve(normal, (scaled.T * weights) @ (target - start))
-    return Expected(centre=tuple(centre), spread=tuple(spread), weights=tuple(found), start=start)
+    slopes = np.linalg.solve(normal, (scaled.T * weights) @ (target - start))
+    return found.model_copy(update={"weights": tuple(slopes)})
 
 
 def _parted(
@@ -265,11 +283,9 @@ def calibrate_core(
         close_cores()
     strata = dict[Target, Strata]()
     for target in ("fine", "base"):
-        own = [(i, each) for i, frame in enumerate(frames) for each in frame["answers"] if each["target"] == target]
-        of = np.array([i for i, _ in own], int)
+        seen, error_deg, of = answers_of(frames, target)
         if len(np.unique(of)) >= LEAST_FRAMES:
-            seen: dict[Feature, Array] = {key: np.array([each[key] for _, each in own], float) for key in ORDER}
-            strata[target] = strata_of(seen, np.array([each["error_deg"] for _, each in own]), of)
+            strata[target] = strata_of(seen, error_deg, of)
     if not strata:
         raise InputError(f"{name}: answers in fewer than {LEAST_FRAMES} of {len(frames)} frames")
     told = [frame["statistics"] for frame in frames]
