@@ -28,7 +28,7 @@ import numpy as np
 
 from benchmarks.measuring import print_markdown
 from simtest.advice import core_calibration
-from simtest.advice.core_calibration import batch_experiment, interval_scores, kept_frame, quantile, shift_of, strata_of
+from simtest.advice.core_calibration import batch_experiment, kept_frame, quantile, shift_of, strata_of
 from simtest.advice.plan import DISTANCES, Question
 from simtest.advice.scope import read_scope
 from simtest.dataset.scoring.frames import CaseFrames, RenderedFrame
@@ -36,6 +36,7 @@ from simtest.estimators import load_estimators
 from simtest.estimators.protocol import Target
 from simtest.reconstruction.regions import (
     LEAST_SET,
+    LEVELS,
     OF_ANSWER,
     OF_FRAME,
     SET_FRAMES,
@@ -153,6 +154,11 @@ def judged(strata: Strata, held: Mapping[str, Array], outside: Array | None = No
     return Judged(held["error_deg"], held["sigma_deg"], held["frame"], radii.reshape(2, -1), stratum)
 
 
+def interval_scores(radius_deg: Array, error_deg: Array) -> Array:
+    """Return what regions of 95 % are judged by, the less the better: the radius, and by how much it is exceeded."""
+    return np.asarray(radius_deg + np.maximum(error_deg - radius_deg, 0) / (1 - LEVELS[1]))
+
+
 def text_of(part: Stratum) -> str:
     """Return a stratum's ends in words."""
     told = []
@@ -205,7 +211,7 @@ def print_study(frames: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
                 if own.sum() and len(np.unique(met.frames[own])) > 4:
                     chances.append((below(hits[own], met.frames[own], 0.9), core, target, text_of(strata.parts[n])))
                     shares.append(100 * hits[own].mean())
-            first.append((core, target, f"{len(error)} / {len(met.error_deg)}", strata.scale, str(len(strata.parts)),
+            first.append((core, target, f"{len(error)} / {len(met.error_deg)}", str(len(strata.parts)),
                           covered(met, 0), covered(met, 1), f"{min(shares):.0f}" if shares else "–",
                           f"{np.median(met.radii_deg[1]):.3g}", f"{score:.2f}", ratio))  # fmt: skip
             for kind in SHIFTED:
@@ -218,7 +224,7 @@ def print_study(frames: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
                     (core, target, text_of(part), str(part.highlights), f"{quantile_ratio(held, part) / ROUND:.2f}")
                     for part in strata.parts
                 ]
-    heads = ("core", "normal", "answers, calibration / fresh", "scale", "strata", "68 %", "95 %", "least of a stratum",
+    heads = ("core", "normal", "answers, calibration / fresh", "strata", "68 %", "95 %", "least of a stratum",
              "median radius (deg)", "score / one radius", "error / deviation alone")  # fmt: skip
     print_markdown([heads, *first])
     print(holm(chances))

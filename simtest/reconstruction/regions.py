@@ -2,8 +2,8 @@
 
 `simtest calibrate core` writes the file (`simtest.advice.core_calibration`). It parts the answers into strata by what
 can be seen without the truth, and states of each how large the errors of 68 and 95 % of the answers were at most, over
-a scale: the standard deviation that the core reports, its root, or what is expected of such a highlight. Frames unlike
-those of the calibration, by the statistics that realism is measured by, get the region of the worst stratum, or none.
+the error that is expected of such an answer in such a frame. Frames unlike those of the calibration, by the statistics
+that realism is measured by, get the region of the worst stratum, or none.
 """
 
 import math
@@ -46,7 +46,6 @@ Feature = Literal["sigma_deg", "axis_ratio", "score", "radius_px", "border", "fl
 Ends = dict[Feature, tuple[float | None, float | None]]
 """What features are at least, and below."""
 
-ScaleKind = Literal["one", "reported", "root", "expected"]
 Positive = Annotated[float, Field(ge=0)]
 Radii = tuple[Positive, Positive]
 """At 68 and at 95 %."""
@@ -134,7 +133,7 @@ class Stratum(Spec):
     ends: Ends
     highlights: int = Field(ge=1, description="it stands on")
     frames: int = Field(ge=1, description="that these are of")
-    ratio: Radii = Field(description="errors over the scale")
+    ratio: Radii = Field(description="errors over those that are expected")
     error_deg: Radii
 
     def holds(self, seen: Mapping[Feature, float]) -> bool:
@@ -148,32 +147,17 @@ class Stratum(Spec):
 class Strata(Spec):
     """What was found of the normals of one surface."""
 
-    scale: ScaleKind = Field(description="over which errors are alike: one, reported deviation, its root, or expected")
     expected: Expected
     parts: tuple[Stratum, ...] = Field(min_length=1)
 
     def region(self, seen: Mapping[Feature, float], outside: bool) -> Radii:
-        """Return the region of an answer, deg.
-
-        Outside of the calibration, or without the deviation that the scale is of, it is that of the worst part.
-        """
-        scale = float(scales(seen, self.expected)[self.scale])
-        own = [each for each in self.parts if each.holds(seen)]
-        if outside or not own or not scale > 0:
-            held = [each.error_deg for each in self.parts]
-            held += [(scale * each.ratio[0], scale * each.ratio[1]) for each in self.parts if scale > 0]
-        else:
-            held = [(scale * own[0].ratio[0], scale * own[0].ratio[1])]
+        """Return the region of an answer, deg; outside of the calibration that of the worst part."""
+        scale = float(self.expected.of(seen))
+        own = [] if outside else [each for each in self.parts if each.holds(seen)]
+        held = [(scale * each.ratio[0], scale * each.ratio[1]) for each in own or self.parts]
+        if not own:
+            held += [each.error_deg for each in self.parts]
         return min(max(each for each, _ in held), MOST_DEG), min(max(each for _, each in held), MOST_DEG)
-
-
-def scales(seen: Seen, expected: Expected) -> dict[ScaleKind, Array]:
-    """Return the scales that errors may be divided by; NaN where the core reports no deviation."""
-    sigma = np.asarray(seen["sigma_deg"], dtype=float)
-    reported = np.where(sigma > 0, sigma, np.nan)
-    return {
-        "one": np.ones_like(sigma), "reported": reported, "root": np.sqrt(reported), "expected": expected.of(seen),
-    }  # fmt: skip
 
 
 class Shift(Spec):
