@@ -29,12 +29,23 @@ import numpy as np
 
 from benchmarks.measuring import print_markdown
 from simtest.advice import core_calibration
-from simtest.advice.core_calibration import batch_experiment, interval_scores, kept_frame, quantile, shift_of, strata_of
+from simtest.advice.core_calibration import batch_experiment, kept_frame, quantile, shift_of, strata_of
 from simtest.advice.plan import DISTANCES, Question
 from simtest.advice.scope import read_scope
 from simtest.dataset.scoring.frames import CaseFrames, RenderedFrame
 from simtest.estimators import load_estimators
-from simtest.reconstruction.regions import LEAST_SET, SET_FRAMES, Shift, Strata, Stratum
+from simtest.estimators.protocol import Target
+from simtest.reconstruction.regions import (
+    LEAST_SET,
+    LEVELS,
+    OF_ANSWER,
+    OF_FRAME,
+    SET_FRAMES,
+    Feature,
+    Shift,
+    Strata,
+    Stratum,
+)
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import write_json
 from simtest.runtime.processes import OnStep, make_engine
@@ -54,7 +65,7 @@ FACTORS, LEAST_OF_FACTOR = ("calibration", "fresh", "other organ"), 20
 ROUND = 1.7308
 """The 95 % quantile of the length of a round normal pair over the root of its covariance's trace."""
 
-Answer = dict[str, Any]
+TARGETS: tuple[Target, ...] = ("fine", "base")
 
 
 @dataclass(frozen=True)
@@ -124,24 +135,30 @@ class Judged:
     stratum: Array
 
 
-def answers(frames: Sequence[Mapping[str, Any]], core: str, target: str) -> dict[str, Array]:
-    """Return a core's answers, by feature, with the number of the frame."""
-    own = [(i, each) for i, frame in enumerate(frames) for each in frame["answers"]
-           if (each["estimator"], each["target"]) == (core, target)]  # fmt: skip
-    names = (*core_calibration.ORDER, "error_deg")
-    return {name: np.array([each[name] for _, each in own], float) for name in names} | {
-        "frame": np.array([i for i, _ in own], int)
-    }
+def answers(frames: Sequence[Mapping[str, Any]], core: str, target: Target) -> dict[str, Array]:
+    """Return a core's answers, by feature, with their errors and the number of the frame."""
+    seen, error_deg, of = core_calibration.answers_of(frames, target, core)
+    return {**seen, "error_deg": error_deg, "frame": of}
+
+
+def features(held: Mapping[str, Array]) -> dict[Feature, Array]:
+    """Return the features alone."""
+    return {name: held[name] for name in (*OF_ANSWER, *OF_FRAME)}
 
 
 def judged(strata: Strata, held: Mapping[str, Array], outside: Array | None = None) -> Judged:
     """Return the regions of answers; `outside`: by frame, whether the check on shift finds it."""
     count = len(held["error_deg"])
-    seen = [{name: float(held[name][i]) for name in core_calibration.ORDER} for i in range(count)]
+    seen = [{name: float(values[i]) for name, values in features(held).items()} for i in range(count)]
     away = np.zeros(count, bool) if outside is None else outside[held["frame"]]
     radii = np.array([strata.region(each, bool(off)) for each, off in zip(seen, away, strict=True)]).T
     stratum = np.array([next(n for n, part in enumerate(strata.parts) if part.holds(each)) for each in seen])
     return Judged(held["error_deg"], held["sigma_deg"], held["frame"], radii.reshape(2, -1), stratum)
+
+
+def interval_scores(radius_deg: Array, error_deg: Array) -> Array:
+    """Return what regions of 95 % are judged by, the less the better: the radius, and by how much it is exceeded."""
+    return np.asarray(radius_deg + np.maximum(error_deg - radius_deg, 0) / (1 - LEVELS[1]))
 
 
 def text_of(part: Stratum) -> str:
@@ -176,12 +193,12 @@ def print_study(frames: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
             for kind, own in frames.items()}  # fmt: skip
     first, shifted, factors, chances = [], [], [], []
     for core in dict.fromkeys(each["estimator"] for frame in known for each in frame["answers"]):
-        for target in ("fine", "base"):
+        for target in TARGETS:
             held = answers(known, core, target)
             if not len(held["error_deg"]) or len(np.unique(held["frame"])) < 40:
                 continue
             error, sigma, of = held["error_deg"], held["sigma_deg"], held["frame"].astype(int)
-            strata = strata_of({name: held[name] for name in core_calibration.ORDER}, error, of)
+            strata = strata_of(features(held), error, of)
             met = judged(strata, answers(fresh, core, target))
             one = interval_scores(np.array(quantile(error, of, 0.95)), met.error_deg).mean()
             score = interval_scores(met.radii_deg[1], met.error_deg).mean() / one
@@ -196,7 +213,7 @@ def print_study(frames: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
                 if own.sum() and len(np.unique(met.frames[own])) > 4:
                     chances.append((below(hits[own], met.frames[own], 0.9), core, target, text_of(strata.parts[n])))
                     shares.append(100 * hits[own].mean())
-            first.append((core, target, f"{len(error)} / {len(met.error_deg)}", strata.scale, str(len(strata.parts)),
+            first.append((core, target, f"{len(error)} / {len(met.error_deg)}", str(len(strata.parts)),
                           covered(met, 0), covered(met, 1), f"{min(shares):.0f}" if shares else "–",
                           f"{np.median(met.radii_deg[1]):.3g}", f"{score:.2f}", ratio))  # fmt: skip
             for kind in SHIFTED:
@@ -208,7 +225,7 @@ def print_study(frames: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
                 on = [held, *(answers(frames.get(kind, ()), core, target) for kind in FACTORS[1:])]
                 factors += [(core, target, text_of(part), str(part.highlights), *(factor(each, part) for each in on))
                             for part in strata.parts]  # fmt: skip
-    heads = ("core", "normal", "answers, calibration / fresh", "scale", "strata", "68 %", "95 %", "least of a stratum",
+    heads = ("core", "normal", "answers, calibration / fresh", "strata", "68 %", "95 %", "least of a stratum",
              "median radius (deg)", "score / one radius", "error / deviation alone")  # fmt: skip
     print_markdown([heads, *first])
     print(holm(chances))

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -51,8 +52,8 @@ ORDER: tuple[Feature, ...] = ("sigma_deg", "score", "flags", "radius_px", "borde
 RECIPE = "endoscopy"
 """Dataset recipe whose ranges reach over real frames."""
 
-FOLDS, SETS, RIDGE, SHRINKAGE = 10, 1000, 0.05, 0.3
-"""The last two of the expected error's weights and of the frames' statistics, over a variance of 1."""
+FOLDS, SETS, RIDGE_FRAMES, SHRINKAGE = 10, 1000, 10.0, 0.3
+"""The last two: how many frames the expected error's weights of 0 count for; of the frames' statistics, over 1."""
 
 # Answers to frames ----------------------------------------------------------------------------------------------------
 
@@ -115,6 +116,19 @@ def kept_frame(frame: RenderedFrame, estimators: Mapping[str, AnyEstimator], det
     return {"statistics": numbers, "answers": answers}
 
 
+def answers_of(
+    frames: Sequence[Mapping[str, Any]], target: Target, core: str | None = None
+) -> tuple[dict[Feature, Array], Array, IntArray]:
+    """Return features, errors, deg, and numbers of the frames of kept answers, by default of all cores, shape (N,)."""
+    own = [(i, each) for i, frame in enumerate(frames) for each in frame["answers"]
+           if each["target"] == target and core in (None, each["estimator"])]  # fmt: skip
+    told = [regions.of_frame(None if (each := frame["statistics"]) is None else np.array(each, float))
+            for frame in frames]  # fmt: skip
+    seen = {name: np.array([each[name] for _, each in own], float) for name in regions.OF_ANSWER}
+    seen |= {name: np.array([told[i][name] for i, _ in own], float) for name in regions.OF_FRAME}
+    return seen, np.array([each["error_deg"] for _, each in own], float), np.array([i for i, _ in own], int)
+
+
 # Strata ---------------------------------------------------------------------------------------------------------------
 
 
@@ -130,35 +144,20 @@ def quantile(values: Array, frames: IntArray, level: float) -> float:
 
 
 def strata_of(seen: Mapping[Feature, Array], error_deg: Array, frames: IntArray) -> Strata:
-    """Find the scale of answers' errors, and the quantiles of these over it in strata; features of shape (N,) each.
+    """Find what errors are expected, and the quantiles of errors over these in strata; features of shape (N,) each.
 
-    The scale is the one with the least mean interval score in all. What is expected of an answer comes, for that and
-    for the quantiles, from other batches' frames.
+    For the quantiles what is expected of an answer comes from other batches' frames.
     """
     fold, others = frames // DISTANCES % FOLDS, np.ones(len(frames))
     for own in (fold == each for each in np.unique(fold)):
         kept, held = ({name: values[which] for name, values in seen.items()} for which in (~own, own))
         others[own] = expected_of(kept, error_deg[~own], frames[~own]).of(held)
-    expected = expected_of(seen, error_deg, frames)
-    known = {**regions.scales(seen, expected), "expected": others}
-
-    def mean_score(scale: Array) -> float:
-        radii = scale * quantile(error_deg / scale, frames, regions.LEVELS[1])
-        return float(interval_scores(radii, error_deg).mean())
-
-    usable = [kind for kind, values in known.items() if np.isfinite(values).all()]
-    chosen = min(usable, key=lambda kind: mean_score(known[kind]))
-    ratios, parts = error_deg / known[chosen], []
+    ratios, parts = error_deg / others, []
     for own, ends in _parted(seen, frames, np.arange(len(frames)), {}, ORDER):
         of = frames[own]
         first, last = (tuple(quantile(each[own], of, p) for p in regions.LEVELS) for each in (ratios, error_deg))
         parts.append(Stratum(ends=ends, highlights=len(own), frames=len(np.unique(of)), ratio=first, error_deg=last))
-    return Strata(scale=chosen, expected=expected, parts=tuple(parts))
-
-
-def interval_scores(radius_deg: Array, error_deg: Array) -> Array:
-    """Return what regions of 95 % are judged by, the less the better: the radius, and by how much it is exceeded."""
-    return np.asarray(radius_deg + np.maximum(error_deg - radius_deg, 0) / (1 - regions.LEVELS[1]))
+    return Strata(expected=expected_of(seen, error_deg, frames), parts=tuple(parts))
 
 
 def expected_of(seen: Mapping[Feature, Array], error_deg: Array, frames: IntArray) -> Expected:
@@ -170,12 +169,16 @@ def expected_of(seen: Mapping[Feature, Array], error_deg: Array, frames: IntArra
     rows, (_, which, counts) = regions.regressors(seen), np.unique(frames, return_inverse=True, return_counts=True)
     weights = 1 / np.sqrt(counts[which])
     weights /= weights.sum()
-    target = np.log(error_deg + np.median(error_deg))
-    centre, spread, start = weights @ rows, rows.std(axis=0) + 1e-9, float(weights @ target)
-    scaled = np.clip((rows - centre) / spread, -3, 3)
-    normal = (scaled.T * weights) @ scaled + RIDGE * np.eye(regions.REGRESSORS)
-    found = np.linalg.solve(normal, (scaled.T * weights) @ (target - start))
-    return Expected(centre=tuple(centre), spread=tuple(spread), weights=tuple(found), start=start)
+    target, told = np.log(error_deg + np.median(error_deg)), np.isfinite(rows)
+    start, known = float(weights @ target), np.maximum(weights @ told, 1e-9)
+    centre = weights @ np.where(told, rows, 0.0) / known
+    off = np.where(told, rows - centre, 0.0)
+    spread = np.sqrt((off**2).sum(axis=0) / np.maximum(told.sum(axis=0), 1)) + 1e-9
+    found = Expected(centre=tuple(centre), spread=tuple(spread), weights=(0.0,) * len(centre), start=start)
+    scaled = found.scaled(rows)
+    normal = (scaled.T * weights) @ scaled + RIDGE_FRAMES / len(counts) * np.eye(regions.REGRESSORS)
+    slopes = np.linalg.solve(normal, (scaled.T * weights) @ (target - start))
+    return found.model_copy(update={"weights": tuple(slopes)})
 
 
 def _parted(
@@ -265,11 +268,9 @@ def calibrate_core(
         close_cores()
     strata = dict[Target, Strata]()
     for target in ("fine", "base"):
-        own = [(i, each) for i, frame in enumerate(frames) for each in frame["answers"] if each["target"] == target]
-        of = np.array([i for i, _ in own], int)
+        seen, error_deg, of = answers_of(frames, target)
         if len(np.unique(of)) >= LEAST_FRAMES:
-            seen: dict[Feature, Array] = {key: np.array([each[key] for _, each in own], float) for key in ORDER}
-            strata[target] = strata_of(seen, np.array([each["error_deg"] for _, each in own]), of)
+            strata[target] = strata_of(seen, error_deg, of)
     if not strata:
         raise InputError(f"{name}: answers in fewer than {LEAST_FRAMES} of {len(frames)} frames")
     told = [frame["statistics"] for frame in frames]

@@ -2,8 +2,8 @@
 
 `simtest calibrate core` writes the file (`simtest.advice.core_calibration`). It parts the answers into strata by what
 can be seen without the truth, and states of each how large the errors of 68 and 95 % of the answers were at most, over
-a scale: the standard deviation that the core reports, its root, or what is expected of such a highlight. Frames unlike
-those of the calibration, by the statistics that realism is measured by, get the region of the worst stratum, or none.
+the error that is expected of such an answer in such a frame. Frames unlike those of the calibration, by the statistics
+that realism is measured by, get the region of the worst stratum, or none.
 """
 
 import math
@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import Field, JsonValue
@@ -36,17 +36,26 @@ LEVELS = (0.68, 0.95)
 SET_FRAMES, LEAST_SET, MOST_OFF = 32, 16, 3.0
 """Frames that are judged together, and the fewest; no frame counts as farther off along a direction."""
 
-MOST_DEG, REGRESSORS = 180.0, 11
+MOST_DEG, FAR_PX = 180.0, 50.0
+"""No region is larger; highlights that are farther apart are alone."""
 
-Format = Literal["simtest core calibration, version 2"]
-Feature = Literal["sigma_deg", "axis_ratio", "score", "radius_px", "border", "flags", "kind"]
+Format = Literal["simtest core calibration, version 3"]
+OfFrame = Literal["count", "radius", "radius spread", "axis ratio", "clustering", "area", "halo", "vessels", "spectrum"]
+Feature = Literal["sigma_deg", "axis_ratio", "score", "radius_px", "border", "flags", "kind", "others", "nearest_px",
+                  "clipped_share", OfFrame]  # fmt: skip
 Ends = dict[Feature, tuple[float | None, float | None]]
 """What features are at least, and below."""
 
-ScaleKind = Literal["one", "reported", "root", "expected"]
 Positive = Annotated[float, Field(ge=0)]
 Radii = tuple[Positive, Positive]
 """At 68 and at 95 %."""
+
+OF_FRAME: tuple[OfFrame, ...] = get_args(OfFrame)
+"""The frame's statistics that tell how large errors are: of its highlights, relief and vessels."""
+
+OF_ANSWER: tuple[Feature, ...] = tuple(name for name in get_args(Feature) if name not in OF_FRAME)
+
+REGRESSORS = 14 + len(OF_FRAME)
 
 Statistics = Annotated[tuple[float, ...], Field(min_length=len(NAMES), max_length=len(NAMES))]
 Numbers = Annotated[tuple[float, ...], Field(min_length=REGRESSORS, max_length=REGRESSORS)]
@@ -55,13 +64,16 @@ Seen = Mapping[Feature, float] | Mapping[Feature, Array]
 
 
 def features(spot: "Specularity", estimate: Estimate, size: tuple[int, int]) -> dict[Feature, float]:
-    """Return what strata are made by: all of it can be seen without the truth.
+    """Return what is known of an answer without the truth, but for its frame's statistics (`of_frame`).
 
     -1 stands for what is not reported; `border` is the peak's distance to the frame's over its width, `flags` their
-    number, `kind` the number of the kind.
+    number, `kind` the number of the kind, `others` how many more highlights are known.
     """
     patch, (x, y), (width, height) = spot.patch, spot.position_px, size
-    area = 0.0 if isinstance(patch, Failure) else float(np.count_nonzero(patch.inside(HIGHLIGHT_ISOVALUE, cut=True)))
+    area, others, clipped = 0.0, np.empty((0, 2)), 0.0
+    if not isinstance(patch, Failure):
+        area = float(np.count_nonzero(patch.inside(HIGHLIGHT_ISOVALUE, cut=True)))
+        others, clipped = patch.neighbours_px - patch.peak_px, patch.clipped_share
     return {
         "sigma_deg": -1.0 if estimate.deviation_deg is None else estimate.deviation_deg,
         "axis_ratio": -1.0 if estimate.axis_ratio is None else estimate.axis_ratio,
@@ -70,7 +82,15 @@ def features(spot: "Specularity", estimate: Estimate, size: tuple[int, int]) -> 
         "border": max(float(min(x, y, width - x, height - y)), 0.0) / width,
         "flags": float(len(estimate.flags)),
         "kind": -1.0 if spot.kind is None else float([*Kind].index(Kind(spot.kind))),
+        "others": float(len(others)),
+        "nearest_px": float(min(np.linalg.norm(others, axis=1), default=FAR_PX)),
+        "clipped_share": clipped,
     }
+
+
+def of_frame(statistics: Array | None) -> dict[Feature, float]:
+    """Return what a frame's realism statistics tell of its answers; NaN where it does not tell one."""
+    return {name: math.nan if statistics is None else float(statistics[NAMES.index(name)]) for name in OF_FRAME}
 
 
 def regressors(seen: Seen) -> Array:
@@ -78,15 +98,20 @@ def regressors(seen: Seen) -> Array:
     sigma, ratio, score, radius = (np.asarray(seen[each]) for each in ("sigma_deg", "axis_ratio", "score", "radius_px"))
     reported = np.where(sigma > 0, np.log(np.maximum(sigma, 0.01)), 0.0)
     bent = np.stack([reported, score, np.log(np.maximum(radius, 0.5)), ratio], axis=-1)
-    others = np.stack([ratio < 0, np.asarray(seen["flags"]), np.minimum(seen["border"], 0.2)], axis=-1)
-    return np.concatenate([bent, bent**2, others], axis=-1)
+    rest = [ratio < 0, np.asarray(seen["flags"]), np.minimum(seen["border"], 0.2), np.log1p(seen["others"]),
+            np.log(np.clip(seen["nearest_px"], 1.0, FAR_PX)), np.asarray(seen["clipped_share"])]  # fmt: skip
+    rest += [np.asarray(seen[name]) for name in OF_FRAME]
+    return np.concatenate([bent, bent**2, np.stack(rest, axis=-1)], axis=-1)
 
 
 # The file -------------------------------------------------------------------------------------------------------------
 
 
 class Expected(Spec):
-    """The error that is expected of an answer by its features: the exponential of a linear form of `regressors`."""
+    """The error that is expected of an answer by its features: the exponential of a linear form of `regressors`.
+
+    What a frame does not tell counts as the mean.
+    """
 
     centre: Numbers
     spread: Numbers
@@ -95,8 +120,11 @@ class Expected(Spec):
 
     def of(self, seen: Seen) -> Array:
         """Return it for answers with these features, deg."""
-        scaled = (regressors(seen) - np.array(self.centre)) / np.array(self.spread)
-        return np.asarray(np.exp(self.start + np.clip(scaled, -3, 3) @ np.array(self.weights)))
+        return np.asarray(np.exp(self.start + self.scaled(regressors(seen)) @ np.array(self.weights)))
+
+    def scaled(self, rows: Array) -> Array:
+        """Return regressors as the weights take them."""
+        return np.nan_to_num(np.clip((rows - np.array(self.centre)) / np.array(self.spread), -3, 3), nan=0.0)
 
 
 class Stratum(Spec):
@@ -105,7 +133,7 @@ class Stratum(Spec):
     ends: Ends
     highlights: int = Field(ge=1, description="it stands on")
     frames: int = Field(ge=1, description="that these are of")
-    ratio: Radii = Field(description="errors over the scale")
+    ratio: Radii = Field(description="errors over those that are expected")
     error_deg: Radii
 
     def holds(self, seen: Mapping[Feature, float]) -> bool:
@@ -119,32 +147,17 @@ class Stratum(Spec):
 class Strata(Spec):
     """What was found of the normals of one surface."""
 
-    scale: ScaleKind = Field(description="over which errors are alike: one, reported deviation, its root, or expected")
     expected: Expected
     parts: tuple[Stratum, ...] = Field(min_length=1)
 
     def region(self, seen: Mapping[Feature, float], outside: bool) -> Radii:
-        """Return the region of an answer, deg.
-
-        Outside of the calibration, or without the deviation that the scale is of, it is that of the worst part.
-        """
-        scale = float(scales(seen, self.expected)[self.scale])
-        own = [each for each in self.parts if each.holds(seen)]
-        if outside or not own or not scale > 0:
-            held = [each.error_deg for each in self.parts]
-            held += [(scale * each.ratio[0], scale * each.ratio[1]) for each in self.parts if scale > 0]
-        else:
-            held = [(scale * own[0].ratio[0], scale * own[0].ratio[1])]
+        """Return the region of an answer, deg; outside of the calibration that of the worst part."""
+        scale = float(self.expected.of(seen))
+        own = [] if outside else [each for each in self.parts if each.holds(seen)]
+        held = [(scale * each.ratio[0], scale * each.ratio[1]) for each in own or self.parts]
+        if not own:
+            held += [each.error_deg for each in self.parts]
         return min(max(each for each, _ in held), MOST_DEG), min(max(each for _, each in held), MOST_DEG)
-
-
-def scales(seen: Seen, expected: Expected) -> dict[ScaleKind, Array]:
-    """Return the scales that errors may be divided by; NaN where the core reports no deviation."""
-    sigma = np.asarray(seen["sigma_deg"], dtype=float)
-    reported = np.where(sigma > 0, sigma, np.nan)
-    return {
-        "one": np.ones_like(sigma), "reported": reported, "root": np.sqrt(reported), "expected": expected.of(seen),
-    }  # fmt: skip
 
 
 class Shift(Spec):
@@ -172,7 +185,7 @@ class Shift(Spec):
 class CoreCalibration(Spec):
     """What was found of a core on frames of a scope."""
 
-    format: Format = "simtest core calibration, version 2"
+    format: Format = "simtest core calibration, version 3"
     core: str = Field(min_length=1, description="its name in results")
     scope: str
     size: tuple[int, int] = Field(description="of the frames, px")
@@ -184,10 +197,10 @@ class CoreCalibration(Spec):
     shift: Shift | None = Field(description="None where the frames are grey")
     made: dict[str, JsonValue] = Field(description="of what, and with which versions")
 
-    def outside(self, image: Image, choices: Choices, options: Options) -> str:
+    def outside(self, size: tuple[int, int], statistics: Array | None, choices: Choices, options: Options) -> str:
         """Return in what a frame, or the search in it, is unlike those of the calibration; empty where it is like."""
-        if (image.shape[1], image.shape[0]) != self.size:
-            return f"of {image.shape[1]} x {image.shape[0]} px, not {self.size[0]} x {self.size[1]}"
+        if size != self.size:
+            return f"of {size[0]} x {size[1]} px, not {self.size[0]} x {self.size[1]}"
         if options.roi is not None or options.keep_overlays or options.smoothing_px is not None:
             return "searched in a region, with overlays kept or with another smoothing, as those were not"
         if (choices.detector, options.every) != (self.detector, self.every):
@@ -195,7 +208,6 @@ class CoreCalibration(Spec):
             return f"searched for {kind} highlights by {choices.detector}, which those were not"
         if self.shift is None:
             return ""
-        statistics = statistics_of(image)
         distance = math.inf if statistics is None else self.shift.distance(statistics)
         return f"{distance:.3g} standard deviations off" if distance > self.shift.limit else ""
 
@@ -254,8 +266,10 @@ def with_regions(
     given = options.regions
     assert given is not None
     files = calibrations_of(given, choices.estimators)
-    outside = {name: own.outside(image, choices, options) for name, own in files.items()}
     size, most = (image.shape[1], image.shape[0]), given.refuse_above_deg or MOST_DEG
+    statistics = statistics_of(image)
+    shared = of_frame(statistics)
+    outside = {name: own.outside(size, statistics, choices, options) for name, own in files.items()}
 
     def judged(spot: "Specularity", name: str, estimate: Estimate | Failure) -> Estimate | Failure:
         if isinstance(estimate, Failure) or name not in files or estimate.target not in files[name].strata:
@@ -263,7 +277,7 @@ def with_regions(
         own, unlike = files[name], outside[name]
         if unlike and given.shifted == "refuse":
             return Failure(Reason.REFUSED, f"the frame is unlike those of the calibration: it is {unlike}")
-        first, last = own.strata[estimate.target].region(features(spot, estimate, size), bool(unlike))
+        first, last = own.strata[estimate.target].region(features(spot, estimate, size) | shared, bool(unlike))
         if last > most:
             return Failure(Reason.REFUSED, f"its calibrated 95 % radius is {last:.3g} deg, above {most:g}")
         source = f"calibrated on {own.highlights} highlights of {own.scope}"

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 import simtest
 from simtest.advice import core_calibration
 from simtest.advice.core_calibration import (
-    ORDER,
     batch_experiment,
     calibrate_core,
     kept_frame,
@@ -34,9 +33,12 @@ from simtest.reconstruction.options import Options
 from simtest.reconstruction.outputs import REGION_COLUMNS, columns_of
 from simtest.reconstruction.regions import (
     LEAST_SET,
+    OF_ANSWER,
+    OF_FRAME,
     SET_FRAMES,
     CoreCalibration,
     check_frames,
+    of_frame,
     read_calibrations,
     statistics_of,
 )
@@ -90,7 +92,7 @@ def drawn(seed, frames=120, each=10):
     """Return features and errors of answers whose reported deviation tells the error, and radius nothing."""
     rng = np.random.default_rng(seed)
     of = np.repeat(np.arange(frames), each)
-    seen = {name: rng.uniform(0.1, 1.0, len(of)) for name in ORDER}
+    seen = {name: rng.uniform(0.1, 1.0, len(of)) for name in (*OF_ANSWER, *OF_FRAME)}
     seen["sigma_deg"] = rng.choice([0.2, 1.0, 8.0], len(of))
     seen["flags"], seen["kind"] = rng.integers(0, 3, len(of)).astype(float), np.full(len(of), -1.0)
     return seen, seen["sigma_deg"] * rng.rayleigh(1.0, len(of)), of
@@ -99,7 +101,6 @@ def drawn(seed, frames=120, each=10):
 def test_strata_part_all_answers_once_and_hold_in_each():
     seen, errors, of = drawn(1)
     strata = strata_of(seen, errors, of)
-    assert strata.scale == "reported"
     assert len(strata.parts) > 2
     assert sum(part.highlights for part in strata.parts) == len(errors)
     fresh, new, _ = drawn(2)
@@ -113,15 +114,33 @@ def test_strata_part_all_answers_once_and_hold_in_each():
             assert np.mean(new[own] <= radii[own]) > share - 0.1
 
 
-def test_the_expected_error_is_the_scale_where_no_deviation_is_reported():
+def test_the_expected_error_follows_what_tells_it():
     seen, errors, of = drawn(3)
     told = {**seen, "sigma_deg": np.full(len(of), -1.0), "radius_px": seen["sigma_deg"]}
-    assert strata_of(told, errors, of).scale == "expected"
+    found = strata_of(told, errors, of)
+    rows = [{name: float(values[i]) for name, values in told.items()} for i in range(0, len(of), 7)]
+    radii = np.array([found.region(each, False)[1] for each in rows])
+    assert np.median(radii[told["radius_px"][::7] == 8.0]) > 4 * np.median(radii[told["radius_px"][::7] == 0.2])
     # A shuffled error depends on nothing.
     shuffled = np.random.default_rng(0).permutation(errors)
     row = {name: float(values[0]) for name, values in told.items()}
     flat = strata_of(told, shuffled, of)
     assert flat.region({**row, "radius_px": 0.2}, False)[1] == pytest.approx(flat.parts[0].error_deg[1], rel=0.5)
+
+
+def test_a_frames_statistics_tell_what_its_errors_are_and_what_is_not_told_counts_as_the_mean():
+    seen, errors, of = drawn(4, frames=300)
+    errors /= seen["sigma_deg"]
+    rough = np.random.default_rng(5).uniform(0.0, 1.0, 300)[of]
+    told = {**seen, "sigma_deg": np.full(len(of), -1.0), "halo": rough}
+    told["vessels"] = np.where(of % 2, np.nan, told["vessels"])
+    strata = strata_of(told, errors * np.exp(2 * rough), of)
+    row = {name: float(values[0]) for name, values in told.items()} | {"vessels": np.nan}
+    smooth, middle, wild, unknown = (strata.expected.of(row | {"halo": halo}) for halo in (0.1, 0.5, 0.9, np.nan))
+    assert wild / smooth > 1.8
+    assert unknown == pytest.approx(middle, rel=0.15)
+    # Of a grey frame nothing is known.
+    assert np.isfinite(strata.region(row | of_frame(None), False)).all()
 
 
 def test_outside_an_answer_has_the_worst_region():
@@ -131,9 +150,6 @@ def test_outside_an_answer_has_the_worst_region():
     sure = {**row, "sigma_deg": 0.2}
     assert strata.region(sure, True)[1] >= max(part.error_deg[1] for part in strata.parts)
     assert strata.region(sure, False)[1] < 1.0
-    # What reports no deviation, where all did in the calibration, is as uncertain.
-    assert strata.region({**row, "sigma_deg": -1.0}, False) == strata.region({**row, "sigma_deg": -1.0}, True)
-    assert strata.region({**row, "sigma_deg": 500.0}, False) == (180.0, 180.0)
 
 
 def test_the_check_on_shift_finds_shifted_frames_and_few_others():
@@ -248,7 +264,7 @@ def test_other_frames_than_the_calibrations_are_told(tmp_path, change, why):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"format": "simtest core calibration, version 1"}, "format"),
+        ({"format": "simtest core calibration, version 2"}, "format"),
         ({"highlights": "many"}, "highlights = 'many'"),
         ({"strata": {}}, "strata"),
         ({"strata": {"middle": {}}}, "strata"),
