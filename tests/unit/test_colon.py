@@ -301,11 +301,6 @@ def test_recipes_load_and_refuse_what_is_malformed(tmp_path):
         load_recipe(tmp_path / "none.toml")
 
 
-def test_pedunculated_polyps_have_no_chart():
-    for more in ("shipped", "polyps and relief", "pedunculated"):
-        assert (build(SHIPPED.model_copy(update=MORE[more])).chart is None) == (more == "pedunculated")
-
-
 def test_interpolated_normals_are_judged_by_their_angle():
     ends = np.array([[[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]] * 5)
     angle = np.radians([0.1, 0.3, 90.0, 179.9, 180.0])

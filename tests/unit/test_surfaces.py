@@ -325,6 +325,7 @@ def test_blocks_give_what_one_piece_gives_and_a_miss_is_one_in_all(session, name
     pixels = np.random.default_rng(1).uniform([-9, -9], [73, 57], (1000, 2))
     origins, directions = session.sightlines.in_model(pixels)
     hits = session.exact_hits(origins, directions)
+    assert name != "colon, stalks" or np.mean(surface.polyp_at(hits) > 0) > 0.05
     hits.distance[::7] = np.inf
     directions[8] = np.nan  # no ray
     backend.load()
