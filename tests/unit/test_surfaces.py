@@ -179,7 +179,7 @@ SURFACES = {
     "colon, tight": {**COLON, "recipe": {"length_mm": 60, "radius_mm": 6, "bend_deg": 170, "sway_deg": 20,
                                          "sway_length_mm": 60, "fold_depth_mm": 2.5, "taenia_mm": 0.3}},
     "colon, closed": {**COLON, "viewpoint": 4, "recipe": {"length_mm": 50, "closed": True, "relief_mm": 0.01}},
-    "colon, stalks": {**COLON, "recipe": {"polyps": [*STALKED, SESSILE[1]]}},
+    "colon, stalks": {**COLON, "viewpoint": 1, "recipe": {"polyps": [*STALKED, SESSILE[1]]}},
     "colon, haustra": {**COLON, "recipe": {"fold_stagger": 0.33, "taenia_ridge_mm": 1.5, "crease_mm": 0.5,
                                            "polyp_count": 8, "polyp_stalked": 0.0}},
     "liver": {"type": "anatomy", "path": "liver"},
