@@ -28,7 +28,7 @@ from simtest.spec import load_dataset
 from simtest.spec.recipes import Dataset
 
 FRAMES = 10**7
-ANATOMIES, SAMPLES = 4, 5
+ANATOMIES, SAMPLES = 22, 3
 """Anatomies that are timed, and samples of each; the shares of the families are those of the recipe."""
 
 COPIES = 30
