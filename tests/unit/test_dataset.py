@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import platform
 import re
 import shlex
 import shutil
@@ -12,6 +13,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import polars as pl
+import psutil
 import pytest
 import yaml
 from hypothesis import given, settings
@@ -30,6 +32,7 @@ from simtest.dataset.shard_writer import _write_shards, write_dataset
 from simtest.dataset.verify import compare, repair_files, reproduce_sample, verify
 from simtest.errors import InputError, SimtestError
 from simtest.pages.markdown import escaped, yaml_string
+from simtest.runtime import processes
 from simtest.runtime.processes import cores_per_task, make_engine
 from simtest.simulation.frame_files import write_frame
 from simtest.simulation.highlights import FAINT, NO_HIGHLIGHT, REMEDIES, STREAK
@@ -961,6 +964,20 @@ def test_the_order_of_keys_in_a_file_does_not_matter():
     drawn = {name: Distribution(low=0.0, high=1.0) for name in ("b", "a", "c")}
     one = _draw(drawn, np.random.default_rng(4))
     assert _draw(dict(reversed(drawn.items())), np.random.default_rng(4)) == one
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library keeps less")
+def test_a_large_worker_gives_back_what_it_has_freed(monkeypatch):
+    held, before = psutil.Process().memory_info, psutil.Process().memory_info().rss
+    pieces = [bytes(100_000) for _ in range(600)]
+    # What stays in between keeps the heap from shrinking.
+    pieces = pieces[::100]
+    processes.give_back()
+    assert held().rss - before > 30e6
+    monkeypatch.setattr(processes, "MOST_BYTES", 0)
+    processes.give_back()
+    assert held().rss - before < 10e6
+    assert len(pieces) == 6
 
 
 def test_a_process_is_replaced_after_its_tasks():
