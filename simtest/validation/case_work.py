@@ -18,6 +18,7 @@ from simtest.runtime.files import write_parquet
 from simtest.runtime.processes import Engine, OnStep
 from simtest.spec import Experiment
 from simtest.spec.recipes import PaperSetting
+from simtest.surfaces import forget_meshes
 from simtest.validation.cases import Case, swept_example
 from simtest.validation.columns import Row, Value, swept_columns, table
 from simtest.validation.paper.gallery_item import save_realisation
@@ -72,6 +73,12 @@ def _estimators(names: tuple[str, ...]) -> dict[str, AnyEstimator]:
     return load_estimators(names)
 
 
+@lru_cache(maxsize=1)
+def _forget_meshes_of_others(experiment: str, label: str) -> None:
+    """Let the meshes of the last label go: the next one's anatomy is another, and each takes a tenth of a gigabyte."""
+    forget_meshes()
+
+
 def forget() -> None:
     """Let this process's rendering session and estimators go."""
     realiser_of.cache_clear()
@@ -104,6 +111,7 @@ def make_rows(part: Part, tell: OnStep) -> pl.DataFrame:
     """Make a part's rows, in the order of its realisations; `tell` is called after each."""
     # The rows must not depend on the parts that this process has made before.
     forgive_cores()
+    _forget_meshes_of_others(part.experiment.name, part.case.label)
     if part.case.is_paper:
         rows = _published(part)
         for _ in part.numbers:

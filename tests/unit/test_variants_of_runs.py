@@ -8,6 +8,7 @@ import pytest
 from simtest.rendering import Session
 from simtest.runtime.processes import LocalEngine, make_engine
 from simtest.spec import load_experiment
+from simtest.validation import case_work
 from simtest.validation.case_work import by_variant
 from simtest.validation.cases import expand
 from simtest.validation.runner import make_jobs, run_experiments, variant_of
@@ -80,6 +81,15 @@ def test_a_grey_experiment_in_the_variant_of_colour_has_other_rows(experiments, 
     assert not made.results.equals(alone["grey"])
     errors = [rows["error_deg"].drop_nulls().to_numpy() for rows in (made.results, alone["grey"])]
     assert np.all(np.abs(errors[0] - errors[1]) > 1e-6)
+
+
+def test_the_meshes_of_a_label_go_when_the_next_one_comes(experiments, tmp_path, monkeypatch):
+    forgotten = []
+    monkeypatch.setattr(case_work, "forget_meshes", lambda: forgotten.append(None))
+    case_work._forget_meshes_of_others.cache_clear()
+    run_experiments([(experiments[name], tmp_path / name) for name in ("grey", "grey_too")])
+    # Of two settings each, which share their label.
+    assert len(forgotten) == 2
 
 
 def test_jobs_of_one_variant_follow_each_other(experiments, tmp_path):
