@@ -132,3 +132,14 @@ def test_the_earliest_point_of_each_light_is_kept():
     points = np.array([[1.0, 1.0], [1.3, 1.0], [1.0, 1.0], [9.0, 1.0], [9.2, 1.4], [9.2, 1.5]])
     kept = highlights.first_of_light(points, 0.5, np.array([0, 0, 1, 0, 0, 0]))
     assert kept.tolist() == [True, False, True, True, False, True]
+
+
+@pytest.mark.parametrize("count", [2, 40, 100])
+def test_few_points_are_told_apart_as_many_are(count, monkeypatch):
+    rng = np.random.default_rng(count)
+    # On a grid, so that some lie at the distance itself.
+    points, owners = rng.integers(0, 24, (count, 2)) / 4, rng.integers(0, 3, count)
+    kept = highlights.first_of_each(points, 0.5, owners)
+    monkeypatch.setattr(highlights, "FEW", 0)
+    assert np.array_equal(kept, highlights.first_of_each(points, 0.5, owners))
+    assert kept.sum() > 1

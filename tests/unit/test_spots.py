@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.measure import label
 from skimage.morphology import local_maxima, reconstruction
+from skimage.segmentation import watershed
 
 from simtest.calibration import srgb_encode
 from simtest.detection.classify import border_of
@@ -15,6 +16,7 @@ from simtest.detection.spots import find_basins
 from simtest.detection.view import find_foreign, find_view
 from simtest.errors import Failure, Reason
 from simtest.geometry import Camera
+from simtest.geometry.patch import connected
 from simtest.reconstruction import detect_in_picture, reconstruct
 from simtest.simulation.highlights import SADDLE
 from simtest.simulation.highlights import find_spots as visible_spots
@@ -78,6 +80,20 @@ def test_visible_spots_are_the_summits_that_morphological_reconstruction_leaves(
     first = [int(np.argmax(np.where(summits == n, light, 0))) for n in range(1, count + 1)]
     spots = visible_spots(light, light)
     assert sorted(first) == sorted((spots.rows * light.shape[1] + spots.columns).tolist())
+
+
+@pytest.mark.parametrize("apart", [30.0, 14.0])
+def test_pixels_of_peaks_that_stand_alone_are_those_of_the_watershed(apart):
+    """The watershed is left out where each connected part holds one peak: 30 px apart, not 14."""
+    specular = (lobe(80.5, 90.5, 5.0) + lobe(80.5 + apart, 94.5, 4.0, 0.9)).astype(np.float32)
+    spots = visible_spots(specular, specular)
+    markers = np.zeros(specular.shape, dtype=int)
+    markers[spots.rows, spots.columns] = [1, 2]
+    half = specular[spots.rows, spots.columns] / 2
+    owners = watershed(-specular, markers, mask=specular >= half.min())
+    owners[specular < np.array([np.inf, *half])[owners]] = 0
+    assert np.array_equal(spots.regions, owners)
+    assert (len(np.unique(connected(specular >= half.min()))) == 3) == (apart == 30.0)
 
 
 def test_a_plateau_has_one_summit_and_an_empty_mask_none():
