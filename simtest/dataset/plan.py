@@ -19,6 +19,7 @@ from simtest.spec import AnatomySurface, Scene, apply_settings, read_toml, scene
 from simtest.spec.keys import replace_values
 from simtest.spec.recipes import Dataset, Distribution, Family
 from simtest.surfaces.recipe import ColonRecipe, load_recipe
+from simtest.surfaces.tube import Tube
 
 ANATOMY_KEYS = ("surface.seed", "surface.path", "surface.recipe")
 """Keys that determine an anatomy."""
@@ -31,6 +32,10 @@ RELIEF_BYTES_PER_PIXEL = 6.0
 
 RADIANCE_BYTES_PER_PIXEL = 6.0
 """Size of the linear radiance: three values of 16 bits."""
+
+
+ANATOMY_DRAWS = 100
+"""Draws of an anatomy before one that cannot be is taken, whose error says why."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,7 @@ class Plan:
     def __init__(self, dataset: Dataset) -> None:
         self.dataset = dataset
         self._bases = [self._base(k, family) for k, family in enumerate(dataset.families)]
+        self._values: dict[Anatomy, dict[str, JsonValue]] = {}
         self.has_polyps = False
         # All that each family may be.
         tried = [self._check(k, family) for k, family in enumerate(dataset.families)]
@@ -287,9 +293,7 @@ class Plan:
         dataset, anatomy = self.dataset, self.anatomy(index)
         family = dataset.families[anatomy.family]
         # Each draw has a branch of the seed tree of its own, so no sample depends on another.
-        values = _draw(family.per_anatomy, self._rng(f"anatomy {anatomy.family}", anatomy.number))
-        if anatomy.seed is not None:
-            values["surface.seed"] = anatomy.seed
+        values = dict(self._values_of(anatomy))
         values |= _draw({**family.per_sample, **dataset.per_sample}, self._rng(f"attempt {attempt}", index))
         seeds = {
             "sensor.seed": integer(dataset.seed, dataset.name, "sample", index, Stage.SENSOR),
@@ -298,6 +302,36 @@ class Plan:
         where = f"{dataset.name}, sample {index}"
         data = apply_settings(self._bases[anatomy.family], {**values, **seeds}, where)
         return Drawn(scene_from_dict(data, where), anatomy, values)
+
+    def _values_of(self, anatomy: Anatomy) -> dict[str, JsonValue]:
+        """Return what is drawn of an anatomy: the first of `ANATOMY_DRAWS` draws that can be, or else the last.
+
+        Ranges that are sound at their ends may close a colon together: deep folds that stand close in a narrow tube.
+        """
+        if anatomy not in self._values:
+            family, rng = self.dataset.families[anatomy.family], self._rng(f"anatomy {anatomy.family}", anatomy.number)
+            for _ in range(ANATOMY_DRAWS):
+                values = _draw(family.per_anatomy, rng)
+                if anatomy.seed is not None:
+                    values["surface.seed"] = anatomy.seed
+                where = f"families.{anatomy.family}"
+                scene = scene_from_dict(apply_settings(self._bases[anatomy.family], values, where), where)
+                if _can_be(scene.surface):
+                    break
+            self._values[anatomy] = values
+        return self._values[anatomy]
+
+
+def _can_be(surface: object) -> bool:
+    """Return whether a surface is no colon that its folds close, or that bends into itself."""
+    if isinstance(surface, AnatomySurface) and surface.file().suffix == ".toml":
+        recipe = load_recipe(surface.file(), surface.recipe_values)
+        try:
+            if isinstance(recipe, ColonRecipe):
+                Tube(recipe)
+        except InputError:
+            return False
+    return True
 
 
 def _made_small(dataset: Dataset) -> tuple[dict[str, float], int]:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from simtest.geometry import vectors
 from simtest.rendering import Session, highlights
 from simtest.rendering.misfits import crossed, exact_misfit
 from simtest.spec.scene import scene_from_dict
@@ -139,7 +140,7 @@ def test_few_points_are_told_apart_as_many_are(count, monkeypatch):
     rng = np.random.default_rng(count)
     # On a grid, so that some lie at the distance itself.
     points, owners = rng.integers(0, 24, (count, 2)) / 4, rng.integers(0, 3, count)
-    kept = highlights.first_of_each(points, 0.5, owners)
-    monkeypatch.setattr(highlights, "FEW", 0)
-    assert np.array_equal(kept, highlights.first_of_each(points, 0.5, owners))
+    kept = highlights.first_of_light(points, 0.5, owners)
+    monkeypatch.setattr(vectors, "FEW", 0)
+    assert np.array_equal(kept, highlights.first_of_light(points, 0.5, owners))
     assert kept.sum() > 1
