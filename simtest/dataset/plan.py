@@ -325,8 +325,8 @@ class Plan:
 def _can_be(surface: object) -> bool:
     """Return whether a surface is no colon that its folds close, or that bends into itself."""
     if isinstance(surface, AnatomySurface) and surface.file().suffix == ".toml":
-        recipe = load_recipe(surface.file(), surface.recipe_values)
         try:
+            recipe = load_recipe(surface.file(), surface.recipe_values)
             if isinstance(recipe, ColonRecipe):
                 Tube(recipe)
         except InputError:

@@ -73,14 +73,10 @@ def test_every_anatomy_of_the_shipped_colons_can_be():
 def test_what_can_never_be_says_why(monkeypatch):
     monkeypatch.setattr("simtest.dataset.plan.ANATOMY_DRAWS", 3)
     dataset = load_dataset("endoscopy")
-    closing = {
-        "surface.recipe.fold_depth_mm": Distribution(low=7.9, high=8.0),
-        "surface.recipe.radius_mm": Distribution(low=8.0, high=8.1),
-        "surface.recipe.fold_spacing_mm": Distribution(low=15.0, high=15.1),
-    }
-    family = dataset.families[0].model_copy(update={"per_anatomy": {**dataset.families[0].per_anatomy, **closing}})
+    bent = {"surface.recipe.length_mm": Distribution(low=60.0, high=61.0)}
+    family = dataset.families[0].model_copy(update={"per_anatomy": {**dataset.families[0].per_anatomy, **bent}})
     plan = Plan(dataset.model_copy(update={"families": (family,), "samples": 3, "samples_per_anatomy": 1}))
-    with pytest.raises(InputError, match="folds leave a radius"):
+    with pytest.raises(InputError, match="bends into itself"):
         Maker(plan).make(0)
 
 
