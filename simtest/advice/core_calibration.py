@@ -157,7 +157,9 @@ def strata_of(seen: Mapping[Feature, Array], error_deg: Array, frames: IntArray)
         of = frames[own]
         first, last = (tuple(quantile(each[own], of, p) for p in regions.LEVELS) for each in (ratios, error_deg))
         parts.append(Stratum(ends=ends, highlights=len(own), frames=len(np.unique(of)), ratio=first, error_deg=last))
-    return Strata(expected=expected_of(seen, error_deg, frames), parts=tuple(parts))
+    told = seen["sigma_deg"]
+    reported = float(told.min()), float(told.max())
+    return Strata(expected=expected_of(seen, error_deg, frames), reported_deg=reported, parts=tuple(parts))
 
 
 def expected_of(seen: Mapping[Feature, Array], error_deg: Array, frames: IntArray) -> Expected:

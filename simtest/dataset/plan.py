@@ -33,7 +33,6 @@ RELIEF_BYTES_PER_PIXEL = 6.0
 RADIANCE_BYTES_PER_PIXEL = 6.0
 """Size of the linear radiance: three values of 16 bits."""
 
-
 ANATOMY_DRAWS = 100
 """Draws of an anatomy before one that cannot be is taken, whose error says why."""
 
@@ -293,8 +292,8 @@ class Plan:
         dataset, anatomy = self.dataset, self.anatomy(index)
         family = dataset.families[anatomy.family]
         # Each draw has a branch of the seed tree of its own, so no sample depends on another.
-        values = dict(self._values_of(anatomy))
-        values |= _draw({**family.per_sample, **dataset.per_sample}, self._rng(f"attempt {attempt}", index))
+        own = _draw({**family.per_sample, **dataset.per_sample}, self._rng(f"attempt {attempt}", index))
+        values = self._values_of(anatomy) | own
         seeds = {
             "sensor.seed": integer(dataset.seed, dataset.name, "sample", index, Stage.SENSOR),
             "render.seed": integer(dataset.seed, dataset.name, "sample", index, Stage.RENDER) % 2**32,

@@ -148,15 +148,21 @@ class Strata(Spec):
     """What was found of the normals of one surface."""
 
     expected: Expected
+    reported_deg: tuple[float, float] = Field(description="least and largest reported deviation; -1: none reported")
     parts: tuple[Stratum, ...] = Field(min_length=1)
 
     def region(self, seen: Mapping[Feature, float], outside: bool) -> Radii:
-        """Return the region of an answer, deg; outside of the calibration that of the worst part."""
-        scale = float(self.expected.of(seen))
+        """Return the region of an answer, deg.
+
+        Outside of the calibration it is that of the worst part, and one of twice what the answer itself reports.
+        """
+        scale, sigma, (least, most) = float(self.expected.of(seen)), seen["sigma_deg"], self.reported_deg
+        # Where no answer reported a deviation none is expected to.
+        outside |= most > 0 and not least <= sigma <= most
         own = [] if outside else [each for each in self.parts if each.holds(seen)]
         held = [(scale * each.ratio[0], scale * each.ratio[1]) for each in own or self.parts]
         if not own:
-            held += [each.error_deg for each in self.parts]
+            held += [*(each.error_deg for each in self.parts), (max(sigma, 0.0), max(2 * sigma, 0.0))]
         return min(max(each for each, _ in held), MOST_DEG), min(max(each for _, each in held), MOST_DEG)
 
 

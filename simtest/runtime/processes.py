@@ -249,7 +249,7 @@ def _work(pipe: Connection, task: Task, threads: int) -> None:
 
 
 def give_back() -> None:
-    """Give the memory that this process has freed back to the system, where it holds more than `MOST_BYTES`."""
+    """Return the memory that this process has freed to the system, where it holds more than `MOST_BYTES`."""
     # Linux tells what it holds; of C libraries glibc alone keeps so much.
     with contextlib.suppress(OSError, AttributeError):
         pages = int(Path("/proc/self/statm").read_text().split()[1])

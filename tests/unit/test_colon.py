@@ -301,6 +301,20 @@ def test_recipes_load_and_refuse_what_is_malformed(tmp_path):
         load_recipe(tmp_path / "none.toml")
 
 
+@pytest.mark.parametrize("more", ["shipped", "pedunculated"])
+def test_no_wall_is_in_the_ball_that_is_told_to_be_free(more):
+    surface, rng = build(SHIPPED.model_copy(update=MORE[more])), np.random.default_rng(3)
+    for site in surface.sites(rng)[:8]:
+        if surface.clearance(site[None])[0] > 0:
+            towards = rng.standard_normal((200, 3))
+            towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+            reach = surface.free_mm(site)
+            assert reach > 0
+            assert (surface.clearance(site + reach * towards) > 0).all()
+            # Not much farther there is one.
+            assert surface.clearance(site[None])[0] < 1.2 * reach
+
+
 def test_interpolated_normals_are_judged_by_their_angle():
     ends = np.array([[[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]] * 5)
     angle = np.radians([0.1, 0.3, 90.0, 179.9, 180.0])

@@ -150,6 +150,12 @@ def test_outside_an_answer_has_the_worst_region():
     sure = {**row, "sigma_deg": 0.2}
     assert strata.region(sure, True)[1] >= max(part.error_deg[1] for part in strata.parts)
     assert strata.region(sure, False)[1] < 1.0
+    # What reports no deviation, where all did in the calibration, is as uncertain, and so is what reports more.
+    assert strata.region({**row, "sigma_deg": -1.0}, False) == strata.region({**row, "sigma_deg": -1.0}, True)
+    assert strata.region({**row, "sigma_deg": 500.0}, False) == (180.0, 180.0)
+    assert strata.region({**row, "sigma_deg": 9.0}, False)[1] >= max(
+        18.0, *(part.error_deg[1] for part in strata.parts)
+    )
 
 
 def test_the_check_on_shift_finds_shifted_frames_and_few_others():
