@@ -29,10 +29,14 @@ from simtest.surfaces.tube import (
     NEWTON_STEPS,
     NEWTON_TOLERANCE_MM,
     TubeChart,
+    TubeNumbers,
 )
 
 BLOCK = 2**17
 """Rays of a launch: they bound the memory."""
+
+CELLS = 512
+"""Parts of the tube along it, each with a list of the folds that reach it: most folds are far from most points."""
 
 _FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
     **dict.fromkeys(("distance", "k_min", "k_max"), ((), float)),
@@ -127,8 +131,9 @@ class TubeKernel:
         constants = {**numbers.constants, "last_knot": len(numbers.panels) - 1}
         self._n = {name: mi.Float64(value) for name, value in constants.items()}
         self._closed = chart.tube.depth > 0
-        rows = {"folds": numbers.folds, "waves": numbers.waves, "stalks": numbers.stalks}
+        rows = {"waves": numbers.waves, "stalks": numbers.stalks}
         self._counts = {name: mi.UInt32(len(values)) for name, values in rows.items()}
+        self._first, self._listed = (mi.UInt32(part.astype(np.uint32)) for part in _lists(numbers))
         # Opaque, so that another colon compiles no new kernel.
         dr.make_opaque(list(self._n.values()), list(self._counts.values()))
 
@@ -304,7 +309,8 @@ class TubeKernel:
         sine_v, cosine_v = dr.sincos(v)
 
         def fold(i: Any, *sums: Any) -> tuple[Any, ...]:
-            along, sine_c, cosine_c, depth, inverse, slant, kappa, *steep = self._folds.row(i)
+            number = dr.gather(mi.UInt32, self._listed, i)
+            along, sine_c, cosine_c, depth, inverse, slant, kappa, *steep = self._folds.row(number)
             sine, cosine = sine_v * cosine_c - cosine_v * sine_c, cosine_v * cosine_c + sine_v * sine_c
             x, leaning = u - along - slant * sine, slant * cosine
             exponent = -dr.square(x) * inverse / 2 + kappa * (cosine - 1)
@@ -321,7 +327,9 @@ class TubeKernel:
                 parts += [p + e for p, e in zip((eu * eu, eu * ev, ev * ev), forms, strict=True)]
             return i + 1, *(total - bump * part for total, part in zip(sums, parts, strict=True))
 
-        sums = self._summed(fold, self._counts["folds"], sums)
+        cell = mi.UInt32(dr.clip((u - n["least"]) * (CELLS / (n["most"] - n["least"])), 0, CELLS - 1))
+        first, last = (dr.gather(mi.UInt32, self._first, cell + k) for k in range(2))
+        sums = self._summed(fold, first, last, sums)
 
         def wave(i: Any, *sums: Any) -> tuple[Any, ...]:
             q, m, phase = self._waves.row(i)  # type: ignore[union-attr]
@@ -332,7 +340,7 @@ class TubeKernel:
             return i + 1, *(total - part for total, part in zip(sums, parts, strict=True))
 
         if self._waves is not None:
-            sums = self._summed(wave, self._counts["waves"], sums)
+            sums = self._summed(wave, mi.UInt32(0), self._counts["waves"], sums)
         if self._closed:
             (r, ru, rv), speed, (h, h1, h2) = sums[:3], frame.speed, frame.fade
             if second:
@@ -368,10 +376,20 @@ class TubeKernel:
         state = (mi.UInt32(0), *(mi.Vector3d(part) for part in wall))
         return tuple(dr.while_loop(state, lambda i, *_: i < self._counts["stalks"], stalk, labels=names)[1:])
 
-    def _summed(self, term: Any, count: Any, sums: list[Any]) -> list[Any]:
+    def _summed(self, term: Any, first: Any, last: Any, sums: list[Any]) -> list[Any]:
         names = ("i", *(f"sum_{i}" for i in range(len(sums))))
-        state = (mi.UInt32(0), *(mi.Float64(part) for part in sums))
-        return list(dr.while_loop(state, lambda i, *_: i < count, term, labels=names)[1:])
+        state = (first, *(mi.Float64(part) for part in sums))
+        return list(dr.while_loop(state, lambda i, *_: i < last, term, labels=names)[1:])
+
+
+def _lists(numbers: TubeNumbers) -> tuple[Array, Array]:
+    """Return where each cell's list of folds starts in the lists, shape (`CELLS` + 1,), and the lists."""
+    edges = np.linspace(numbers.constants["least"], numbers.constants["most"], CELLS + 1)[:, None]
+    low, high = numbers.folds[:, 0] - numbers.reaches, numbers.folds[:, 0] + numbers.reaches
+    # A cell more on both sides: a place at an edge may round into either.
+    margin = edges[1] - edges[0]
+    reached = (low <= edges[1:] + margin) & (high >= edges[:-1] - margin)
+    return np.append(0, np.cumsum(reached.sum(axis=1))), np.nonzero(reached)[1]
 
 
 def _along(length: _Jet, axis: Any) -> _Jet:

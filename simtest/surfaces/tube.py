@@ -270,6 +270,7 @@ class TubeNumbers:
     # (K, 7) or (K, 8): along, sine and cosine of the centre, depth, 1 / width^2, slant and kappa of each fold (see
     # `_Fold`), and where any is steep how steep
     folds: Array
+    reaches: Array  # (K,): how far from its middle along the tube each fold reaches, mm
     waves: Array  # (W, 3): q, m and phase of the relief's waves
     # (knots, 2 + 2 * powers): x and z of each knot, then of the polynomial's coefficients about it, the lowest first
     panels: Array
@@ -596,7 +597,7 @@ class Tube:
         panels = np.hstack([self._knot_points[:, [0, 2]], powers])
         stalks = [(*s.foot, *s.axis, s.height, s.width, s.depth) for s in self._stalks.values()]
         waves = np.array(self._relief).reshape(-1, 3)
-        return TubeNumbers(constants, np.array(folds), waves, panels, np.array(stalks).reshape(-1, 9))
+        return TubeNumbers(constants, np.array(folds), self._reach, waves, panels, np.array(stalks).reshape(-1, 9))
 
     def frame(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return T, rho and tau, three arrays of shape (N, 3)."""
