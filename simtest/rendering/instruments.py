@@ -34,6 +34,10 @@ PER_METAL = 8
 """Numbers of an instrument's metal: roughness, matt share, metal (3), matt base (3)."""
 
 
+NEAR, ALONG = 1.01, 1e-6
+"""Of a cone's radius, how near a ray's line passes that is tried; the squared sine to the axis below which all are."""
+
+
 @dataclass(frozen=True)
 class Metal:
     """Instruments' reflectance, in place of `Material`: GGX with Schlick's Fresnel term, blended with a matt base."""
@@ -90,11 +94,15 @@ class InstrumentKernel:
     def first(self, origin: Any, direction: Any, active: Any) -> tuple[Any, Any]:
         """Return the distance to the first cone on rays, mitsuba.Vector3d, unit; inf without; and the cone's number."""
 
-        def step(part: Any, nearest: Any, nearest_part: Any) -> tuple[Any, Any, Any]:
+        def met(part: Any, nearest: Any, nearest_part: Any) -> tuple[Any, Any]:
             for root, valid in self._roots(part, origin, direction, active):
                 closer = valid & (root > 0) & (root < nearest)
                 nearest, nearest_part = dr.select(closer, root, nearest), dr.select(closer, part, nearest_part)
-            return part + 1, nearest, nearest_part
+            return nearest, nearest_part
+
+        def step(part: Any, *found: Any) -> tuple[Any, Any, Any]:
+            near = self._passes(part, origin, direction, active)
+            return part + 1, *dr.if_stmt((part, *found), near, met, lambda part, *found: found)
 
         start = (mi.UInt32(0), mi.Float64(dr.inf), mi.UInt32(0))
         _, nearest, nearest_part = dr.while_loop(start, lambda part, *_: active & (part < self._count), step)
@@ -104,15 +112,28 @@ class InstrumentKernel:
         """Return which rays, mitsuba.Ray3f of unit directions, meet a cone before their end; in single precision."""
         origin, direction = mi.Vector3f(ray.o), mi.Vector3f(ray.d)
 
-        def step(part: Any, hidden: Any) -> tuple[Any, Any]:
+        def met(part: Any, hidden: Any) -> Any:
             for root, valid in self._roots(part, origin, direction, active):
                 hidden |= valid & (root > 0) & (root < ray.maxt)
-            return part + 1, hidden
+            return hidden
+
+        def step(part: Any, hidden: Any) -> tuple[Any, Any]:
+            # A branch, since few rays pass near.
+            near = self._passes(part, origin, direction, active)
+            return part + 1, dr.if_stmt((part, hidden), near, met, lambda part, hidden: hidden)
 
         _, hidden = dr.while_loop(
             (mi.UInt32(0), mi.Bool(False)), lambda part, hidden: active & ~hidden & (part < self._count), step
         )
         return hidden
+
+    def _passes(self, part: Any, o: Any, d: Any, active: Any) -> Any:
+        """Return which rays' lines pass a round cone's axis, as a line, no farther off than its radii, and some more."""
+        start, axis, _, r1, r2, *_ = self._shape(part, active, type(o))
+        across = dr.cross(d, axis)
+        squared, reach = dr.squared_norm(across), NEAR * dr.maximum(r1, r2)
+        # Nearly along the axis, rounding decides.
+        return (dr.square(dr.dot(o - start, across)) <= dr.square(reach) * squared) | (squared < ALONG)
 
     def _roots(self, part: Any, o: Any, d: Any, active: Any) -> Iterator[tuple[Any, Any]]:
         """Yield where rays enter each ball, and both roots of the cone between their tangents; and whether they do."""
