@@ -49,8 +49,8 @@ class FileEntry(BaseModel):
 
 # Whoever writes a manifest can write its digest too, so what it lists is not trusted: a name that leaves the folder is
 # never opened.
-_PART = "[A-Za-z0-9_][A-Za-z0-9._-]{0,200}"
-Files = dict[Annotated[str, Field(pattern=f"^({_PART}/)?{_PART}$")], FileEntry]
+_PLAIN = "[A-Za-z0-9_][A-Za-z0-9._-]{0,200}"
+Files = dict[Annotated[str, Field(pattern=f"^({_PLAIN}/)?{_PLAIN}$")], FileEntry]
 
 
 class Manifest(BaseModel):

@@ -96,8 +96,8 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
     """Write what a manifest lacks: shards with their rows, then index and card; return the `shortfall`."""
     # Shards that were removed, or some of their rows, are made anew.
     for shard in plan.shards:
-        if not all((folder / name).exists() for name in shard_files(shard)):
-            manifest.shards.pop(shard.name, None)
+        if shard.name in manifest.shards and not all((folder / name).exists() for name in shard_files(shard)):
+            del manifest.shards[shard.name]
     # what is left to do
     missing = [number for number, shard in enumerate(plan.shards) if shard.name not in manifest.shards]
     # A worker, on another machine of a cluster for one, may have another current folder.
@@ -122,11 +122,11 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
         step(0)
     _write_shards(plan, manifest, folder, engine.run(write_shard, tasks, step), missing)
     # index and card, of all shards
-    lacks = not manifest.complete or not all((folder / name).exists() for name in (SAMPLES, CARD))
-    if lacks:
+    unfinished = not manifest.complete or not all((folder / name).exists() for name in (SAMPLES, CARD))
+    if unfinished:
         write_index(plan, folder)
     few = shortfall(plan, folder)
-    if lacks:
+    if unfinished:
         write_card(plan, manifest, few, folder)
         manifest.tables |= {name: file_entry(folder / name) for name in (SAMPLES, CARD)}
         manifest.complete = True
