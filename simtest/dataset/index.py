@@ -4,7 +4,7 @@ That of the samples is one file. The others have too many rows to be joined: the
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import polars as pl
@@ -112,6 +112,16 @@ def table_file(shard: Shard, name: str) -> str:
 def shard_files(shard: Shard) -> tuple[str, ...]:
     """Return the files that stay of a shard: its own, and those of its rows."""
     return (shard.name, *(table_file(shard, name) for name in FOLDERS))
+
+
+def make_tables(plan: Plan, folder: Path) -> Iterator[tuple[str, pl.DataFrame]]:
+    """Make the tables of a finished dataset from its shards, one file after the other."""
+    rows = []
+    for shard in plan.shards:
+        tables = shard_tables(plan, folder, shard)
+        rows.append(tables[SAMPLES])
+        yield from ((table_file(shard, name), tables[name]) for name in FOLDERS)
+    yield SAMPLES, pl.concat(rows).sort("index")
 
 
 def shard_tables(plan: Plan, folder: Path, shard: Shard) -> dict[str, pl.DataFrame]:

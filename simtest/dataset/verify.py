@@ -12,7 +12,7 @@ import polars as pl
 
 from simtest.dataset.card import CARD, make_card
 from simtest.dataset.fields import BY_SUFFIX, COVERING, FIELDS, INSTRUMENT, POLYP, VISIBLE
-from simtest.dataset.index import FOLDERS, SAMPLES, shard_files, shard_tables, shortfall, table_file
+from simtest.dataset.index import FOLDERS, SAMPLES, make_tables, shard_files, shortfall
 from simtest.dataset.maker import Maker
 from simtest.dataset.manifest import (
     NAME,
@@ -310,35 +310,25 @@ def _angle_to_depth(points: AnyArray, normal: AnyArray) -> float:
 
 def _tables(folder: Path, manifest: Manifest, plan: Plan, damaged: set[str]) -> list[Fault]:
     # Another version of simtest may write other columns and another card; their hashes are checked in any case.
-    same_code = _is_of_this_code(manifest)
-    sound, rows, faults = set(manifest.tables) - damaged, [], list[Fault]()
-    for shard in plan.shards:
-        tables = shard_tables(plan, folder, shard)
-        rows.append(tables[SAMPLES])
-        for name in FOLDERS:
-            if (file := table_file(shard, name)) in sound:
-                faults += _table(folder, file, tables[name], same_code)
-    if SAMPLES in sound:
-        faults += _table(folder, SAMPLES, pl.concat(rows).sort("index"), same_code)
+    same_code, faults = _is_of_this_code(manifest), list[Fault]()
+    for name, table in make_tables(plan, folder):
+        if name in damaged or name not in manifest.tables:
+            continue
+        try:
+            there = pl.read_parquet(folder / name)
+        except (pl.exceptions.PolarsError, OSError) as error:
+            faults.append(Fault(name, f"cannot be read ({str(error).splitlines()[0]})"))
+            continue
+        # Columns in common, if other code has written the tables
+        columns = table.columns if same_code else [name for name in there.columns if name in table.columns]
+        if (same_code and there.columns != columns) or not there.select(columns).equals(table.select(columns)):
+            faults.append(Fault(name, "differs from what the shards say"))
     # Made from the tables, the card is compared with sound ones only.
     if same_code and not damaged and not faults:
         card = make_card(plan, manifest, shortfall(plan, folder))
         if (folder / CARD).read_text(encoding="utf-8") != card:
             faults.append(Fault(CARD, "differs from the card that the manifest gives"))
     return faults
-
-
-def _table(folder: Path, name: str, table: pl.DataFrame, same_code: bool) -> Iterator[Fault]:
-    """Check a table's file against the rows that the shards give."""
-    try:
-        there = pl.read_parquet(folder / name)
-    except (pl.exceptions.PolarsError, OSError) as error:
-        yield Fault(name, f"cannot be read ({str(error).splitlines()[0]})")
-        return
-    # Columns in common, if other code has written the table
-    columns = table.columns if same_code else [name for name in there.columns if name in table.columns]
-    if (same_code and there.columns != columns) or not there.select(columns).equals(table.select(columns)):
-        yield Fault(name, "differs from what the shards say")
 
 
 def reproduce_sample(folder: Path, index: int, out: Path, variant: str | None = None) -> list[Path]:

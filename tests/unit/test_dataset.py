@@ -562,6 +562,8 @@ def test_a_table_that_is_one_file_is_read_as_versions_before_wrote_it(copy, tmp_
             "shards.../secret.tar = '../secret.tar': must match",
         ),
         (lambda c: c["tables"].update({"..": {"bytes": 1, "sha256": "0"}}), "must match the pattern"),
+        (lambda c: c["tables"].update({"x.parquet/..": {"bytes": 1, "sha256": "0"}}), "must match the pattern"),
+        (lambda c: c["tables"].update({"a/b/c": {"bytes": 1, "sha256": "0"}}), "must match the pattern"),
         (lambda c: c["tables"].update({"x.parquet": {"bytes": 1}}), "x.parquet.sha256: missing"),
     ],
 )
