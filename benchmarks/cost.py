@@ -19,20 +19,21 @@ import numpy as np
 import polars as pl
 
 from benchmarks.measuring import Figure, print_markdown
-from simtest.dataset.index import write_shard_tables, write_tables
+from simtest.dataset.index import HIGHLIGHTS, SAMPLES, shard_tables, shortfall, table_file, write_index
 from simtest.dataset.maker import Maker
 from simtest.dataset.plan import Plan, Shard
-from simtest.dataset.shard import PART, finish, write_sample
+from simtest.dataset.shard import finish, write_sample
 from simtest.runtime.arrays import Array
+from simtest.runtime.files import make_folder, write_parquet
 from simtest.spec import load_dataset
 from simtest.spec.recipes import Dataset
 
 FRAMES = 10**7
-ANATOMIES, SAMPLES = 22, 3
+ANATOMIES, EACH = 22, 3
 """Anatomies that are timed, and samples of each; the shares of the families are those of the recipe."""
 
 COPIES = 30
-"""Times that a shard is read for the tables."""
+"""Shards whose rows are read for the index and the card."""
 
 WORKERS = 1000
 CORE_HOUR, TB_MONTH = 0.04, 20.0
@@ -47,7 +48,7 @@ class Measured:
 
     `samples_s`, `anatomies_s`: processor time of each sample, encoding and writing included, and of each anatomy
     beyond that of its samples, s; `sample_bytes`: mean size of a sample in its shard; `tables_s`: time of one
-    sample in the tables that one process makes at the end, s; `plan`: the plan of ten million frames.
+    sample in the index and card that one process makes at the end, s; `plan`: the plan of ten million frames.
     """
 
     samples_s: Array
@@ -78,7 +79,7 @@ def recipes() -> dict[str, Dataset]:
     return {name: load_dataset(name, {"seed": seed}) for name in ("smooth", "endoscopy")}
 
 
-def measure(dataset: Dataset, anatomies: int = ANATOMIES, samples: int = SAMPLES) -> Measured:
+def measure(dataset: Dataset, anatomies: int = ANATOMIES, samples: int = EACH) -> Measured:
     """Make some samples of new anatomies one by one, and write them."""
     # One thread, as a worker has that shares the processor with others.
     os.environ["SIMTEST_THREADS"] = "1"
@@ -129,23 +130,28 @@ def _blocks(plan: Plan, count: int) -> list[int]:
 
 
 def _tables(plan: Plan, folder: Path, made: list[int]) -> float:
-    """Return the processor time of one sample in the tables, s, from the rows that its worker has written."""
+    """Return the processor time of one sample in what one process does once all shards are there, s."""
 
     class Written(Plan):
         shards: tuple[Shard, ...] = (Shard("train", 0, tuple(made)),)
 
     written, times = Written(plan.dataset), []
-    write_shard_tables(written, folder, written.shards[0])
+    rows = shard_tables(written, folder, written.shards[0])
     # Few samples were made; a shard of the run has more rows.
     more = max(round(plan.samples_per_shard / len(made)), 1)
-    for part in folder.glob(f"*.parquet{PART}"):
-        pl.concat([pl.read_parquet(part)] * more).write_parquet(part)
-    for copies in (1, 1, COPIES):
-        # The same shard over and over: what is left of the difference is the samples' own.
-        written.shards = Written.shards * copies
+    shards = tuple(Shard("train", number, ()) for number in range(COPIES))
+    for shard in shards:
+        for name in (SAMPLES, HIGHLIGHTS):
+            copies = range(more * shard.number, more * (shard.number + 1))
+            table = pl.concat([rows[name].with_columns(index=pl.col("index") + FRAMES * copy) for copy in copies])
+            make_folder((folder / table_file(shard, name)).parent)
+            write_parquet(folder / table_file(shard, name), table.with_columns(shard=pl.lit(shard.name)))
+    for written.shards in (shards[:1], shards[:1], shards):
         start = time.process_time()
-        write_tables(written, folder)
+        write_index(written, folder)
+        shortfall(written, folder)
         times.append(time.process_time() - start)
+    # What is left of the difference is the samples' own.
     return (times[2] - times[1]) / (COPIES - 1) / (more * len(made))
 
 
@@ -161,7 +167,7 @@ def table(measured: Mapping[str, Measured]) -> list[list[str]]:
         ("10^7 samples: core hours", lambda m: f"{hours(m):,.0f}"),
         ("10^7 samples: TB", lambda m: f"{FRAMES * m.sample_bytes / 1e12:.1f}"),
         ("10^7 samples: shards", lambda m: f"{m.shards:,}"),
-        ("tables joined at the end, by one process, h", lambda m: f"{FRAMES * m.tables_s / 3600:.1f}"),
+        ("index and card at the end, by one process, h", lambda m: f"{FRAMES * m.tables_s / 3600:.1f}"),
         (
             f"price at {CORE_HOUR:g} a core hour and {TB_MONTH:g} a TB and month, one month",
             lambda m: f"{price(m):,.0f}",
@@ -184,11 +190,11 @@ def figures() -> list[Figure]:
     """Measure all recipes, and print their table beside what one process does alone."""
     measured = {name: measure(dataset) for name, dataset in recipes().items()}
     print_markdown(table(measured))
-    name = f"tables joined by one process, share of a run of {WORKERS} workers, "
+    name = f"index and card by one process, share of a run of {WORKERS} workers, "
     return [Figure(name + recipe, alone(own), 1 - LINEAR, unit="") for recipe, own in measured.items()]
 
 
 def alone(measured: Measured) -> float:
-    """Return the share of a run of `WORKERS` workers in which they wait for the process that joins the tables."""
+    """Return the share of a run of `WORKERS` workers in which they wait for the process that makes index and card."""
     joining = FRAMES * measured.tables_s
     return joining / (FRAMES * measured.sample_s / WORKERS + joining)

@@ -10,7 +10,7 @@ import polars as pl
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE
-from simtest.dataset.index import ESTIMATES, HIGHLIGHTS, SAMPLES
+from simtest.dataset.index import HIGHLIGHTS, SAMPLES, TABLES
 from simtest.dataset.manifest import Manifest
 from simtest.dataset.metadata import has_relief
 from simtest.dataset.plan import Plan
@@ -58,7 +58,7 @@ def make_card(plan: Plan, manifest: Manifest, lacking: str = "") -> str:
         has_relief=plan.has_relief,
         has_instruments=plan.has_instruments,
         draws=list(_draws(plan)),
-        tables=(SAMPLES, HIGHLIGHTS, ESTIMATES),
+        tables=TABLES,
         meshes=sorted({path.name for path in plan.inputs if path.suffix != ".toml"}),
         isovalue=HIGHLIGHT_ISOVALUE,
         versions=manifest.origin["versions"],
@@ -105,20 +105,24 @@ def write_preview(folder: Path, page: Path, count: int = 24) -> Path:
         raise InputError(f"--samples {count}: must be 1 to {MAX_SAMPLES}")
     shard_names(folder)
     manifest = open_manifest(folder)
-    index, highlights = (read_table(folder / name) for name in (SAMPLES, HIGHLIGHTS))
+    index = read_table(folder / SAMPLES)
+    # A file of them after the other, since all highlights may be more than memory holds.
+    files = [folder / name for name in manifest.tables if name.startswith(HIGHLIGHTS)]
+    columns = ["index", "isolated", "distance_mm", "kd_min", "kd_max"]
+    isolated = pl.concat(read_table(file, columns).filter(pl.col("isolated")) for file in files)
     # samples, evenly over the dataset, and the shards that hold them
     places = np.linspace(0, index.height - 1, min(count, index.height)).round().astype(int)
     wanted = set(index["index"].sort()[places.tolist()].to_list())
     names = index.filter(pl.col("index").is_in(list(wanted)))["shard"].unique().to_list()
     shown = read_samples(folder, shards=sorted(names), indices=wanted)
-    charts = list(_histograms(index, highlights))
+    charts = list(_histograms(index, isolated))
     html = (
         environment()
         .get_template("preview.html.j2")
         .render(
             title=manifest.dataset["title"] or manifest.dataset["name"],
             description=manifest.dataset["description"],
-            facts=_facts(index, highlights),
+            facts=_facts(index),
             charts=charts,
             **embedded(charts),
             cards=[_card(sample) for sample in sorted(shown, key=lambda sample: sample.index)],
@@ -128,13 +132,13 @@ def write_preview(folder: Path, page: Path, count: int = 24) -> Path:
     return page
 
 
-def _facts(index: pl.DataFrame, highlights: pl.DataFrame) -> list[tuple[str, str]]:
+def _facts(index: pl.DataFrame) -> list[tuple[str, str]]:
     by_split = index.group_by("split", maintain_order=True).len().sort("split")
-    isolated, sizes = highlights.filter(pl.col("isolated")).height, index["bytes"].to_numpy()
+    sizes = index["bytes"].to_numpy()
     return [
         ("samples", f"{index.height} ({', '.join(f'{split} {n}' for split, n in by_split.rows())})"),
         ("anatomies", str(index.select("family", "anatomy").unique().height)),
-        ("highlights", f"{highlights.height}, of them {isolated} isolated"),
+        ("highlights", f"{index['n_highlights'].sum()}, of them {index['n_isolated'].sum()} isolated"),
         ("frames without an isolated one", str(index.filter(pl.col("n_isolated") == 0).height)),
         ("size", f"{sizes.sum() / 1e6:.1f} MB, {np.median(sizes) / 1e6:.2f} MB a sample"),
     ]
@@ -210,9 +214,8 @@ def _data_url(image: AnyArray) -> str:
 # Distributions ------------------------------------------------------------------------------------------------------
 
 
-def _histograms(index: pl.DataFrame, highlights: pl.DataFrame) -> Iterator[Chart]:
+def _histograms(index: pl.DataFrame, isolated: pl.DataFrame) -> Iterator[Chart]:
     """Yield the histogram of each quantity that varies."""
-    isolated = highlights.filter(pl.col("isolated"))
     # Light offsets are drawn for each sample, distances belong to its highlights.
     offsets = {i: json.loads(drawn).get("rig.lights.0.offset_mm") for i, drawn in index.select("index", "drawn").rows()}
     distances = isolated.select("index", "distance_mm").rows()

@@ -1,7 +1,10 @@
-"""Tables beside the shards: samples, highlights and estimates, all made from the metadata in the shards."""
+"""Tables beside the shards: samples, highlights and estimates, all made from the metadata in the shards.
+
+That of the samples is one file. The others have too many rows to be joined: they are folders of a file a shard.
+"""
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import polars as pl
@@ -9,13 +12,15 @@ import polars as pl
 from simtest.conventions import ON_INSTRUMENT
 from simtest.dataset.metadata import HighlightMeta, SampleMeta
 from simtest.dataset.plan import Plan, Shard
+from simtest.dataset.reader import read_table
 from simtest.dataset.shard import PART, samples
-from simtest.runtime.files import write_parquet
+from simtest.runtime.files import make_folder, write_parquet
 from simtest.simulation.highlights import NO_HIGHLIGHT, REMEDIES
 from simtest.validation.columns import COLUMNS, NUMBER, TEXT, WHOLE, YES_NO, Column, Row, Value
 
 SAMPLES, HIGHLIGHTS, ESTIMATES = "index.parquet", "highlights.parquet", "estimates.parquet"
 TABLES = (SAMPLES, HIGHLIGHTS, ESTIMATES)
+FOLDERS = (HIGHLIGHTS, ESTIMATES)
 
 SAMPLE_COLUMNS = {
     "index": Column(WHOLE, "number of the sample, its key in the shard, and the split that it belongs to"),
@@ -99,9 +104,24 @@ def _highlight_row(meta: SampleMeta, number: int, truth: HighlightMeta) -> tuple
     )  # fmt: skip
 
 
-def make_tables(plan: Plan, folder: Path) -> dict[str, pl.DataFrame]:
-    """Make the tables from the shards; rows in the order of the samples."""
-    return _joined(shard_tables(plan, folder, shard) for shard in plan.shards)
+def table_file(shard: Shard, name: str) -> str:
+    """Return the file of a shard's rows of a table: final in the table's folder, or waiting for `write_index`."""
+    return f"{name}/{Path(shard.name).stem}.parquet" if name in FOLDERS else f"{shard.name}.{name}{PART}"
+
+
+def shard_files(shard: Shard) -> tuple[str, ...]:
+    """Return the files that stay of a shard: its own, and those of its rows."""
+    return (shard.name, *(table_file(shard, name) for name in FOLDERS))
+
+
+def make_tables(plan: Plan, folder: Path) -> Iterator[tuple[str, pl.DataFrame]]:
+    """Make the tables of a finished dataset from its shards, one file after the other."""
+    rows = []
+    for shard in plan.shards:
+        tables = shard_tables(plan, folder, shard)
+        rows.append(tables[SAMPLES])
+        yield from ((table_file(shard, name), tables[name]) for name in FOLDERS)
+    yield SAMPLES, pl.concat(rows).sort("index")
 
 
 def shard_tables(plan: Plan, folder: Path, shard: Shard) -> dict[str, pl.DataFrame]:
@@ -131,59 +151,49 @@ def _table(rows: list[Row], columns: Mapping[str, Column]) -> pl.DataFrame:
     return pl.DataFrame({name: [row.get(name) for row in rows] for name in columns}, schema=schema, strict=False)
 
 
-def _joined(parts: Iterable[Mapping[str, pl.DataFrame]]) -> dict[str, pl.DataFrame]:
-    """Join the rows of all shards, in the order of the samples."""
-    of_shards = list(parts)
-    # Stable: rows of one sample stay in their order.
-    return {
-        name: pl.concat([part[name] for part in of_shards]).sort("index", maintain_order=True).rechunk()
-        for name in TABLES
-    }
-
-
 def write_shard_tables(plan: Plan, folder: Path, shard: Shard) -> None:
-    """Write the rows of a finished shard beside it, for `write_tables`; done by the worker that made the shard."""
+    """Write the rows of a finished shard; done by the worker that made the shard."""
     for name, table in shard_tables(plan, folder, shard).items():
-        write_parquet(_part(folder, shard, name), table)
+        path = folder / table_file(shard, name)
+        make_folder(path.parent)
+        write_parquet(path, table)
 
 
-def write_tables(plan: Plan, folder: Path) -> dict[str, pl.DataFrame]:
-    """Write the tables, from the rows that workers have written or else from the shards; return them."""
-    tables = _joined(_written(plan, folder, shard) for shard in plan.shards)
-    for name, table in tables.items():
-        write_parquet(folder / name, table)
-    return tables
+def write_index(plan: Plan, folder: Path) -> None:
+    """Write the table of the samples, in their order, from the rows that workers have written or else the shards."""
+    rows = (_read_rows(plan, folder, shard, SAMPLES) for shard in plan.shards)
+    write_parquet(folder / SAMPLES, pl.concat(rows).sort("index").rechunk())
 
 
-def _written(plan: Plan, folder: Path, shard: Shard) -> dict[str, pl.DataFrame]:
-    """Read the rows of a shard; make them anew where they are missing or cannot be read."""
+def _read_rows(plan: Plan, folder: Path, shard: Shard, name: str, columns: list[str] | None = None) -> pl.DataFrame:
+    """Read a shard's rows of a table; make them anew where they are missing or cannot be read."""
     try:
-        return {name: pl.read_parquet(_part(folder, shard, name)) for name in TABLES}
+        return pl.read_parquet(folder / table_file(shard, name), columns=columns)
     except (OSError, pl.exceptions.PolarsError):
-        return shard_tables(plan, folder, shard)
+        return shard_tables(plan, folder, shard)[name]
 
 
-JUDGED = {SAMPLES: ["index", "n_highlights", "n_isolated"], HIGHLIGHTS: ["index", "isolated", "why_not", "peak_snr"]}
-"""Columns that `shortfall` needs."""
-
-
-def shortfall(plan: Plan, tables: Mapping[str, pl.DataFrame]) -> str:
+def shortfall(plan: Plan, folder: Path) -> str:
     """Return how many samples show too few isolated highlights, why, and what to change; empty where none does.
 
     A recipe that takes every frame is told where most show no highlight at all.
     """
-    dataset, samples = plan.dataset, tables[SAMPLES]
+    samples = read_table(folder / SAMPLES, ["index", "shard", "n_highlights", "n_isolated"])
+    dataset = plan.dataset
     few = samples.filter(
         pl.col("n_isolated") < dataset.highlights if dataset.highlights else pl.col("n_highlights") == 0
     )
     if few.is_empty() or (not dataset.highlights and few.height <= samples.height / 2):
         return ""
-    # That of the highlight which stands out most, as in `simtest views`.
-    others = tables[HIGHLIGHTS].filter(~pl.col("isolated")).sort("peak_snr", descending=True, nulls_last=True)
-    reasons = few.join(others.unique("index", keep="first", maintain_order=True), on="index", how="left")
-    counts = (
-        reasons["why_not"].fill_null(NO_HIGHLIGHT).value_counts().sort("count", "why_not", descending=[True, False])
-    )
+    # Shard after shard: all highlights together are more than memory holds.
+    lacking, others = set(few["shard"]), []
+    for shard in (shard for shard in plan.shards if shard.name in lacking):
+        rows = _read_rows(plan, folder, shard, HIGHLIGHTS, ["index", "isolated", "why_not", "peak_snr"])
+        # That of the highlight which stands out most, as in `simtest views`.
+        rows = rows.filter(~pl.col("isolated")).sort("peak_snr", descending=True, nulls_last=True)
+        others.append(rows.unique("index", keep="first", maintain_order=True).select("index", "why_not"))
+    reasons = few.join(pl.concat(others), on="index", how="left")["why_not"].fill_null(NO_HIGHLIGHT)
+    counts = reasons.value_counts().sort("count", "why_not", descending=[True, False])
     text = f"{few.height} of {samples.height} samples show "
     if dataset.highlights:
         text += f"fewer isolated highlights than highlights = {dataset.highlights} asks for; the last of "
@@ -196,7 +206,3 @@ def shortfall(plan: Plan, tables: Mapping[str, pl.DataFrame]) -> str:
     if meshes := [path.name for path in plan.inputs if path.suffix != ".toml"]:
         text += f"; `simtest mesh check` says whether {', '.join(meshes)} is fine enough"
     return text
-
-
-def _part(folder: Path, shard: Shard, name: str) -> Path:
-    return folder / f"{shard.name}.{name}{PART}"

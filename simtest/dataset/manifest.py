@@ -49,21 +49,23 @@ class FileEntry(BaseModel):
 
 # Whoever writes a manifest can write its digest too, so what it lists is not trusted: a name that leaves the folder is
 # never opened.
-Files = dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,200}$")], FileEntry]
+_PLAIN = "[A-Za-z0-9_][A-Za-z0-9._-]{0,200}"
+Files = dict[Annotated[str, Field(pattern=f"^({_PLAIN}/)?{_PLAIN}$")], FileEntry]
 
 
 class Manifest(BaseModel):
     """Record of a dataset's folder, updated as files are finished."""
 
+    complete: bool  # all shards, tables and the card are there
     dataset: dict[str, JsonValue]  # the whole specification, as JSON
     origin: Origin  # versions, source, variant and hashes of the inputs
     environment: dict[str, str | None]  # commit, Python and processor
     shards: Files  # finished shards by name
-    tables: Files  # finished tables and card by name; there once all shards are
+    tables: Files  # finished tables and card by name: the rows of finished shards, the others once all shards are
 
     def save(self, folder: Path) -> None:
         """Write the manifest, with a digest of its own content."""
-        content = {"format": FORMAT, "complete": bool(self.tables), **self.model_dump()}
+        content = {"format": FORMAT, **self.model_dump()}
         content |= {key: dict(sorted(content[key].items())) for key in ("shards", "tables")}
         write_json(folder / NAME, {**content, "digest": _digest(content)})
 
@@ -82,9 +84,8 @@ def new_manifest(plan: Plan, variant: str) -> Manifest:
     }
     found = provenance.environment()
     environment = {name: found[name] for name in ("commit", "python", "processor", "system")}
-    return Manifest(
-        dataset=plan.dataset.model_dump(mode="json"), origin=origin, environment=environment, shards={}, tables={}
-    )
+    dataset = plan.dataset.model_dump(mode="json")
+    return Manifest(complete=False, dataset=dataset, origin=origin, environment=environment, shards={}, tables={})
 
 
 def _input_hashes(plan: Plan) -> dict[str, str]:

@@ -83,7 +83,7 @@ def open_manifest(folder: Path) -> Manifest:
 def shard_names(folder: Path, split: str | None = None) -> list[str]:
     """Return the names of a finished dataset's shards, of one split or of all."""
     manifest = open_manifest(folder)
-    if not manifest.tables:
+    if not manifest.complete:
         raise InputError(f"{folder}: the dataset is not finished; give its simtest dataset command again")
     splits = sorted({name.rpartition("-")[0] for name in manifest.shards})
     if split is not None and split not in splits:

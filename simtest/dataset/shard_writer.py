@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import IO
 
 from simtest.dataset.card import CARD, write_card
-from simtest.dataset.index import JUDGED, TABLES, shortfall, write_shard_tables, write_tables
+from simtest.dataset.index import SAMPLES, shard_files, shortfall, write_index, write_shard_tables
 from simtest.dataset.maker import Maker
 from simtest.dataset.manifest import (
     NAME,
-    FileEntry,
+    Files,
     Manifest,
     ManifestError,
     check_same,
@@ -25,7 +25,6 @@ from simtest.dataset.manifest import (
     read_manifest,
 )
 from simtest.dataset.plan import Plan, Shard
-from simtest.dataset.reader import read_table
 from simtest.dataset.shard import PART, Sample, finish, whole_samples, write_sample
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
@@ -87,15 +86,18 @@ def write_dataset(
     load_estimators(dataset.estimators)
     with _telling_what_stays(folder), exclusive_folder(folder):
         manifest = _open(folder, plan, colour_variant(variant))
-        _complete(plan, manifest, folder, engine, progress)
-        tables = {name: read_table(folder / name, columns) for name, columns in JUDGED.items()}
-    if few := shortfall(plan, tables):
+        few = _complete(plan, manifest, folder, engine, progress)
+    if few:
         warnings.warn(few, stacklevel=2)
     return manifest
 
 
-def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, progress: Progress | None) -> None:
-    """Write what a manifest lacks: shards, then tables and card."""
+def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, progress: Progress | None) -> str:
+    """Write what a manifest lacks: shards with their rows, then index and card; return the `shortfall`."""
+    # Shards that were removed, or some of their rows, are made anew.
+    for shard in plan.shards:
+        if shard.name in manifest.shards and not all((folder / name).exists() for name in shard_files(shard)):
+            del manifest.shards[shard.name]
     # what is left to do
     missing = [number for number, shard in enumerate(plan.shards) if shard.name not in manifest.shards]
     # A worker, on another machine of a cluster for one, may have another current folder.
@@ -114,30 +116,37 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
 
     # shards
     if tasks:
-        # The tables of a dataset that was complete before no longer fit.
-        manifest.tables = {}
+        manifest.complete = False
         manifest.save(folder)
         # The time left is measured from the end of the first sample on.
         step(0)
     _write_shards(plan, manifest, folder, engine.run(write_shard, tasks, step), missing)
-    # tables and card, of all shards
-    if not manifest.tables or not all((folder / name).exists() for name in manifest.tables):
-        write_card(plan, manifest, shortfall(plan, write_tables(plan, folder)), folder)
-        manifest.tables = {name: file_entry(folder / name) for name in (*TABLES, CARD)}
+    # index and card, of all shards
+    unfinished = not manifest.complete or not all((folder / name).exists() for name in (SAMPLES, CARD))
+    if unfinished:
+        write_index(plan, folder)
+    few = shortfall(plan, folder)
+    if unfinished:
+        write_card(plan, manifest, few, folder)
+        manifest.tables |= {name: file_entry(folder / name) for name in (SAMPLES, CARD)}
+        manifest.complete = True
         manifest.save(folder)
-    # rows of single shards, and parts of interrupted runs
-    for left in folder.glob(f"*{PART}*"):
+    # the index's rows of single shards, and parts of interrupted runs
+    for left in (*folder.glob(f"*{PART}*"), *folder.glob(f"*.parquet/*{PART}*")):
         left.unlink(missing_ok=True)
+    return few
 
 
 def _write_shards(
-    plan: Plan, manifest: Manifest, folder: Path, finished: Iterator[tuple[int, FileEntry]], missing: list[int]
+    plan: Plan, manifest: Manifest, folder: Path, finished: Iterator[tuple[int, Files]], missing: list[int]
 ) -> None:
     """Enter shards into the manifest as they are finished; the manifest is saved whatever ends the run, but a kill."""
     unsaved = 0
     try:
-        for task, entry in finished:
-            manifest.shards[plan.shards[missing[task]].name] = entry
+        for task, files in finished:
+            name = plan.shards[missing[task]].name
+            manifest.shards[name] = files.pop(name)
+            manifest.tables |= files
             unsaved += 1
             if unsaved > UNSAVED_SHARE * len(manifest.shards):
                 manifest.save(folder)
@@ -153,8 +162,7 @@ def remake(folder: Path, manifest: Manifest, broken: list[str], engine: Engine, 
     with _telling_what_stays(folder), exclusive_folder(folder, "DATASET"):
         for name in broken:
             (folder / name).unlink(missing_ok=True)
-            manifest.shards.pop(name, None)
-        manifest.tables = {}
+        manifest.complete = False
         manifest.save(folder)
         _complete(plan, manifest, folder, engine, progress)
 
@@ -182,13 +190,9 @@ def _open(folder: Path, plan: Plan, variant: str) -> Manifest:
         wanted.save(folder)
         return wanted
     check_same(folder, there, wanted)
-    # Shards that were removed are made anew.
-    for name in [name for name in there.shards if not (folder / name).exists()]:
-        del there.shards[name]
     # A file that was cut or changed since is not taken for a finished one.
-    listed = {**there.shards, **{name: entry for name, entry in there.tables.items() if name in TABLES}}
-    for name, entry in listed.items():
-        if (path := folder / name).exists() and (said := entry.wrong_size(path)):
+    for name, entry in {**there.shards, **there.tables}.items():
+        if name != CARD and (path := folder / name).exists() and (said := entry.wrong_size(path)):
             raise InputError(f"--out {folder}: {name} {said}; simtest dataset verify --repair mends it")
     return there
 
@@ -202,25 +206,25 @@ def maker_of(dataset: str, variant: str) -> Maker:
     return Maker(Plan(Dataset.model_validate_json(dataset)), variant)
 
 
-def write_shard(task: ShardTask, on_step: OnStep) -> FileEntry:
-    """Write a shard, or finish one that was begun; call `on_step` after each sample."""
+def write_shard(task: ShardTask, on_step: OnStep) -> Files:
+    """Write a shard and its rows, or finish one that was begun; call `on_step` after each sample."""
     folder, maker = Path(task.folder), maker_of(task.dataset, task.variant)
     shard = maker.plan.shards[task.number]
     with _telling_what_stays(folder):
-        entry = _write_shard(folder, maker, shard, on_step)
+        _write_shard(folder, maker, shard, on_step)
         # Here, not at the end: one process would take hours for the tables of millions of samples.
         write_shard_tables(maker.plan, folder, shard)
-        return entry
+        return {name: file_entry(folder / name) for name in shard_files(shard)}
 
 
-def _write_shard(folder: Path, maker: Maker, shard: Shard, on_step: OnStep) -> FileEntry:
+def _write_shard(folder: Path, maker: Maker, shard: Shard, on_step: OnStep) -> None:
     path = folder / shard.name
     part = folder / (shard.name + PART)
     # finished, but not in the manifest: the run was killed in between
     if path.is_file() and _is_whole(path, shard):
         for _ in shard.indices:
             on_step()
-        return file_entry(path)
+        return
     # begun, or not yet
     # A writer whose parent was killed may live for another moment.
     with waiting_for(part) as file:
@@ -235,7 +239,6 @@ def _write_shard(folder: Path, maker: Maker, shard: Shard, on_step: OnStep) -> F
         os.fsync(file.fileno())
         os.replace(part, path)
     sync_folder(folder)
-    return file_entry(path)
 
 
 def _is_whole(path: Path, shard: Shard) -> bool:

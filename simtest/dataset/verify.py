@@ -12,7 +12,7 @@ import polars as pl
 
 from simtest.dataset.card import CARD, make_card
 from simtest.dataset.fields import BY_SUFFIX, COVERING, FIELDS, INSTRUMENT, POLYP, VISIBLE
-from simtest.dataset.index import TABLES, make_tables, shortfall
+from simtest.dataset.index import FOLDERS, SAMPLES, make_tables, shard_files, shortfall
 from simtest.dataset.maker import Maker
 from simtest.dataset.manifest import (
     NAME,
@@ -97,35 +97,50 @@ def verify(folder: Path, progress: Progress | None = None) -> list[Fault]:
 def _files(folder: Path, manifest: Manifest, plan: Plan) -> Iterator[Fault]:
     """Check which files exist, and their sizes and hashes."""
     planned = {shard.name for shard in plan.shards}
+    belonging = _belonging(plan)
     # manifest against plan
     for name in sorted(planned - set(manifest.shards)):
         yield Fault(name, "not finished; the dataset's command goes on with it")
     for name in sorted(set(manifest.shards) - planned):
         yield Fault(NAME, f"lists {name}, which the dataset does not have")
-    if not planned - set(manifest.shards):
-        yield from (Fault(name, "missing in the manifest") for name in (*TABLES, CARD) if name not in manifest.tables)
+    # Another version of simtest may write other tables.
+    if not planned - set(manifest.shards) and _is_of_this_code(manifest):
+        lacking = belonging - {*manifest.shards, *manifest.tables}
+        yield from (Fault(name, "missing in the manifest") for name in sorted(lacking))
     # files against manifest
     for name, entry in {**manifest.shards, **manifest.tables}.items():
-        yield from _against(folder / name, entry)
+        yield from _against(folder, name, entry)
     # files that do not belong
-    known = {NAME, LOCK, EXPORT, EXPORTING, *manifest.shards, *manifest.tables, *planned}
-    for path in sorted(folder.iterdir()):
-        if path.name in known:
+    known = {NAME, LOCK, EXPORT, EXPORTING, *manifest.shards, *manifest.tables, *belonging}
+    known |= {name for name in FOLDERS if (folder / name).is_dir() and not (folder / name).is_symlink()}
+    for path in sorted(path for name in ("*", *(f"{name}/*" for name in FOLDERS)) for path in folder.glob(name)):
+        name = path.relative_to(folder).as_posix()
+        if name in known:
             continue
-        if path.name.endswith(PART):
+        if name.endswith(PART):
             if not planned - set(manifest.shards):
-                yield Fault(path.name, "left over from a stopped run")
+                yield Fault(name, "left over from a stopped run")
         else:
-            yield Fault(path.name, "does not belong to the dataset")
+            yield Fault(name, "does not belong to the dataset")
 
 
-def _against(path: Path, entry: FileEntry) -> Iterator[Fault]:
+def _belonging(plan: Plan) -> set[str]:
+    """Return the files of a finished dataset besides its manifest."""
+    return {SAMPLES, CARD, *(name for shard in plan.shards for name in shard_files(shard))}
+
+
+def _is_of_this_code(manifest: Manifest) -> bool:
+    return manifest.origin.get("source") == provenance.source_hash()
+
+
+def _against(folder: Path, name: str, entry: FileEntry) -> Iterator[Fault]:
+    path = folder / name
     if path.is_symlink() or not path.is_file():
-        yield Fault(path.name, "is no plain file" if path.exists() else "missing")
+        yield Fault(name, "is no plain file" if path.exists() else "missing")
     elif said := entry.wrong_size(path):
-        yield Fault(path.name, said)
+        yield Fault(name, said)
     elif file_entry(path).sha256 != entry.sha256:
-        yield Fault(path.name, "differs from its SHA-256 in the manifest")
+        yield Fault(name, "differs from its SHA-256 in the manifest")
 
 
 def repair_files(folder: Path, faults: list[Fault], engine: Engine, progress: Progress | None = None) -> list[Fault]:
@@ -139,7 +154,7 @@ def repair_files(folder: Path, faults: list[Fault], engine: Engine, progress: Pr
     manifest = read_manifest(folder)
     now = new_manifest(manifest.plan(), str(manifest.origin["variant"]))
     check_same(folder, manifest, now)
-    known = {shard.name for shard in now.plan().shards} | {*TABLES, CARD}
+    known = _belonging(now.plan())
     # A folder may hold anything: it stays, and is listed again.
     foreign = [folder / fault.file for fault in faults if fault.file not in known]
     for path in (path for path in foreign if path.is_symlink() or not path.is_dir()):
@@ -293,26 +308,27 @@ def _angle_to_depth(points: AnyArray, normal: AnyArray) -> float:
     return float(np.degrees(np.nanmedian(np.arcsin(np.clip(sine, 0, 1)))))
 
 
-def _tables(folder: Path, manifest: Manifest, plan: Plan, damaged: set[str]) -> Iterator[Fault]:
+def _tables(folder: Path, manifest: Manifest, plan: Plan, damaged: set[str]) -> list[Fault]:
     # Another version of simtest may write other columns and another card; their hashes are checked in any case.
-    same_code = manifest.origin.get("source") == provenance.source_hash()
-    is_listed = CARD not in damaged and CARD in manifest.tables
-    tables = make_tables(plan, folder)
-    card = make_card(plan, manifest, shortfall(plan, tables))
-    if same_code and is_listed and (folder / CARD).read_text(encoding="utf-8") != card:
-        yield Fault(CARD, "differs from the card that the manifest gives")
-    for name, table in tables.items():
+    same_code, faults = _is_of_this_code(manifest), list[Fault]()
+    for name, table in make_tables(plan, folder):
         if name in damaged or name not in manifest.tables:
             continue
         try:
             there = pl.read_parquet(folder / name)
         except (pl.exceptions.PolarsError, OSError) as error:
-            yield Fault(name, f"cannot be read ({str(error).splitlines()[0]})")
+            faults.append(Fault(name, f"cannot be read ({str(error).splitlines()[0]})"))
             continue
         # Columns in common, if other code has written the tables
         columns = table.columns if same_code else [name for name in there.columns if name in table.columns]
         if (same_code and there.columns != columns) or not there.select(columns).equals(table.select(columns)):
-            yield Fault(name, "differs from what the shards say")
+            faults.append(Fault(name, "differs from what the shards say"))
+    # Made from the tables, the card is compared with sound ones only.
+    if same_code and not damaged and not faults:
+        card = make_card(plan, manifest, shortfall(plan, folder))
+        if (folder / CARD).read_text(encoding="utf-8") != card:
+            faults.append(Fault(CARD, "differs from the card that the manifest gives"))
+    return faults
 
 
 def reproduce_sample(folder: Path, index: int, out: Path, variant: str | None = None) -> list[Path]:

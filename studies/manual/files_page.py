@@ -108,7 +108,7 @@ empty), `error`, `answered`, `unanswered`, `breaks`, `is_broken` (the best metho
 ## A dataset
 
 `simtest dataset` writes shards, tables, manifest.json and README.md; [Datasets](../howto/datasets.md)
-explains them.
+explains them. highlights.parquet and estimates.parquet are folders of a file a shard.
 
 ### Images of a sample
 

@@ -48,7 +48,8 @@ def keys(name: str, data: bytes) -> dict[str, bytes]:
 
 def differences(one: Path, other: Path) -> list[str]:
     """Return which files of two folders differ, and in what."""
-    names = sorted({path.name for folder in (one, other) for path in folder.iterdir()})
+    held = ((folder, path) for folder in (one, other) for path in folder.rglob("*") if not path.is_dir())
+    names = sorted({path.relative_to(folder).as_posix() for folder, path in held})
     found = []
     for name in names:
         if not ((one / name).is_file() and (other / name).is_file()):
