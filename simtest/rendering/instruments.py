@@ -128,7 +128,7 @@ class InstrumentKernel:
         return hidden
 
     def _passes(self, part: Any, o: Any, d: Any, active: Any) -> Any:
-        """Return which rays' lines pass a round cone's axis, as a line, no farther off than its radii, and some more."""
+        """Return which rays pass the line of a round cone's axis no farther off than its radii, and some more."""
         start, axis, _, r1, r2, *_ = self._shape(part, active, type(o))
         across = dr.cross(d, axis)
         squared, reach = dr.squared_norm(across), NEAR * dr.maximum(r1, r2)

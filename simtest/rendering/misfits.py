@@ -130,17 +130,20 @@ def trace_misfits(tracer: Tracer, lights: Array, stride: int) -> MisfitMaps:
     sources = [mi.Vector3f(*light.tolist()) for light in lights]
     spacing, half, across = mi.Float(stride), mi.Float(stride // 2 + PIXEL_CENTRE), mi.UInt32(width)
     dr.make_opaque(sources, spacing, half, across)
-    rows: list[list[Image]] = []
+    surfaces = 1 if tracer.relief is None else 2
+    channels = np.empty((1 + surfaces * len(lights) * 2, height * width), dtype=np.float32)
     for first, count in blocks_of(height * width):
         start = mi.UInt32(first)
         dr.make_opaque(start)
         index = dr.arange(mi.UInt32, count) + start
         row = index // across
         x, y = ((mi.Float(i) - MARGIN) * spacing + half for i in (index - row * across, row))
-        rows.append(evaluate(_misfits_at(tracer, x, y, sources, base=tracer.relief is not None), count))
-    channels = [np.concatenate(pieces).reshape(height, width) for pieces in zip(*rows, strict=True)]
-    both = np.stack(channels[1:]).reshape(-1, len(lights), 2, height, width)
-    return MisfitMaps(channels[0], both[0], both[-1], MARGIN, stride)
+        found = evaluate(_misfits_at(tracer, x, y, sources, base=surfaces == 2), count)
+        # One after the other: they are many.
+        for channel, values in zip(channels, found, strict=True):
+            channel[first : first + count] = values
+    both = channels[1:].reshape(surfaces, len(lights), 2, height, width)
+    return MisfitMaps(channels[0].reshape(height, width), both[0], both[-1], MARGIN, stride)
 
 
 def trace_tiles(tracer: Tracer, lights: Array, division: int, corners: IntArray, size: int) -> Image:
@@ -154,7 +157,7 @@ def trace_tiles(tracer: Tracer, lights: Array, division: int, corners: IntArray,
     across = size * division + 2
     width, cells = mi.UInt32(across), mi.Float(division)
     dr.make_opaque(width, cells)
-    step, pieces = max(1, LANES // across**2), [np.empty((2, 0, across, across), dtype=np.float32)]
+    step, maps = max(1, LANES // across**2), np.empty((2, len(corners), across, across), dtype=np.float32)
     for first in range(0, len(corners), step):
         chosen = corners[first : first + step]
         count = len(chosen) * across**2
@@ -168,8 +171,9 @@ def trace_tiles(tracer: Tracer, lights: Array, division: int, corners: IntArray,
         x, y = (start + (mi.Float(cell) + (PIXEL_CENTRE - 1)) / cells
                 for start, cell in zip(starts, within, strict=True))  # fmt: skip
         channels = evaluate(_misfits_at(tracer, x, y, [mi.Vector3f(a, b, c)], base=False)[1:], count)
-        pieces.append(np.stack(channels).reshape(2, len(chosen), across, across))
-    return np.concatenate(pieces, axis=1)
+        for whole, channel in zip(maps, channels, strict=True):
+            whole[first : first + step] = channel.reshape(len(chosen), across, across)
+    return maps
 
 
 def _misfits_at(tracer: Tracer, x: Any, y: Any, sources: list[Any], base: bool) -> list[Any]:
