@@ -132,22 +132,34 @@ angles = st.floats(-180, 180)
 def test_rays_meet_a_grasper_first_on_its_surface(session, azimuth, roll, tilt, opening, seed):
     grasper = Instrument(kind="grasper", azimuth_deg=azimuth, roll_deg=roll, tilt_deg=tilt, opening_deg=opening)
     cones = round_cones({3: grasper}, {3: np.array([1.0, -2.0, 50.0])})
+    from simtest.rendering.backend import mi
     from simtest.rendering.instruments import InstrumentKernel
 
     kernel = InstrumentKernel(cones, {3: grasper})
     rng = np.random.default_rng(seed)
     targets = cones.starts[rng.integers(len(cones.starts), size=64)] + rng.normal(0, 2, (64, 3))
-    rays = targets / np.linalg.norm(targets, axis=1, keepdims=True)
-    distance, normal, owner = kernel.cast(np.zeros(3), rays)
+    # From the camera, and along the cones' axes or nearly so, inside their radii and outside.
+    axes = ((cones.ends - cones.starts) / cones.lengths[:, None]).repeat(8, axis=0)
+    aside = rng.normal(0, cones.radii.max(axis=1).repeat(8))[:, None] * np.cross(axes, rng.normal(size=axes.shape))
+    nearly = axes + 10.0 ** rng.uniform(-9, -2, (len(axes), 1)) * rng.normal(size=axes.shape)
+    eyes = np.concatenate([np.zeros_like(targets), cones.starts.repeat(8, axis=0) + aside - 60 * axes])
+    outside = cones.distances(eyes).min(axis=1) > 0
+    eyes, rays = eyes[outside], np.concatenate([targets, nearly])[outside]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    distance, normal, owner = kernel.cast(eyes, rays)
     hit = np.isfinite(distance)
     assert set(owner[hit]) <= {3}
     assert (owner[~hit] == -1).all()
     # Outside all the way, and on the surface at its end.
     far = np.where(hit, distance, 100.0)
-    way = np.linspace(0, 1, 200)[:-1, None, None] * (far[:, None] * rays)
+    way = eyes + np.linspace(0, 1, 200)[:-1, None, None] * (far[:, None] * rays)
     assert cones.distances(way.reshape(-1, 3)).min() > -1e-9
-    place = distance[hit, None] * rays[hit]
+    place = eyes[hit] + distance[hit, None] * rays[hit]
     assert np.abs(cones.distances(place).min(axis=1)).max(initial=0) < 1e-9
+    # Shadow rays, in single precision, but for those that only graze.
+    deep = cones.distances(place + 0.1 * rays[hit]).min(axis=1) < -1e-3
+    shadow = mi.Ray3f(*(mi.Vector3f(np.ascontiguousarray(part[hit][deep].T)) for part in (eyes, rays)))
+    assert np.array(kernel.blocked(shadow, mi.Bool(True))).all()
     # The normal is the distance's gradient, but where two parts meet.
     h = 1e-5
     around = [cones.distances(place + sign * h * axis).min(axis=1) for axis in np.eye(3) for sign in (1, -1)]
