@@ -18,7 +18,7 @@ import numpy as np
 
 from simtest.rendering.backend import dr, mi
 from simtest.rendering.kernel_values import to_kernel, vectors_from_kernel, vectors_to_kernel
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, IntArray
 from simtest.surfaces import RayHits
 from simtest.surfaces.tube import (
     ACROSS,
@@ -382,7 +382,7 @@ class TubeKernel:
         return list(dr.while_loop(state, lambda i, *_: i < last, term, labels=names)[1:])
 
 
-def _lists(numbers: TubeNumbers) -> tuple[Array, Array]:
+def _lists(numbers: TubeNumbers) -> tuple[IntArray, IntArray]:
     """Return where each cell's list of folds starts in the lists, shape (`CELLS` + 1,), and the lists."""
     edges = np.linspace(numbers.constants["least"], numbers.constants["most"], CELLS + 1)[:, None]
     low, high = numbers.folds[:, 0] - numbers.reaches, numbers.folds[:, 0] + numbers.reaches
