@@ -136,7 +136,8 @@ class Frame:
     __repr__ = short_repr
 
 
-@dataclass(frozen=True)
+# Compared by identity: it is a key of what is made from it.
+@dataclass(frozen=True, eq=False)
 class MisfitMaps:
     """Normal minus bisector across the sightline (see `exact_misfit`) of the rendered shape, a map for each light.
 

@@ -351,8 +351,8 @@ class CloudRegions:
         maps, lights = session.misfits(), tuple(centre.light for centre in centres)
         places = [(centre.light, *centre.bp_px.tolist()) for centre in centres]
         # Asked for again by what scores the frame
-        if (last := _LAST.get(session)) is not None and last[0] is maps and last[1] == places:
-            return last[2]
+        if (last := _LAST.get(maps)) is not None and last[0] == places:
+            return last[1]
         inside = slice(maps.margin, -maps.margin)
         w = maps.base[:, :, inside, inside]
         misfit = np.hypot(w[:, 0], w[:, 1])
@@ -369,7 +369,7 @@ class CloudRegions:
             labels[light] = nearest[target].reshape(labels.shape[1:])
         seen = session.camera.seen
         regions = cls(labels, misfit if seen is None else np.where(seen, misfit, np.nan), lights)
-        _LAST[session] = maps, places, regions
+        _LAST[maps] = places, regions
         return regions
 
     def assign(self, lights: IntArray, points_px: Array) -> list[int | None]:
@@ -396,8 +396,8 @@ class CloudRegions:
         return [each if math.isfinite(each) else 0.0 for each in least]
 
 
-_LAST: WeakKeyDictionary[Session, tuple[MisfitMaps, list[tuple[float, ...]], CloudRegions]] = WeakKeyDictionary()
-"""Each session's last regions, with the misfits and the highlight points that they are of."""
+_LAST: WeakKeyDictionary[MisfitMaps, tuple[list[tuple[float, ...]], CloudRegions]] = WeakKeyDictionary()
+"""The last regions of misfits, as long as these are held, with the highlight points that they are of."""
 
 
 def _ends(size: Image) -> IntArray:
