@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, reduce
+from functools import cached_property, lru_cache, reduce
 
 import numpy as np
 
@@ -196,9 +196,14 @@ def _planes(values: Image) -> Sequence[Image]:
 
 def falloff_map(camera: Camera, profile: AngularProfile, axis: tuple[float, float, float] = OPTICAL_AXIS) -> Array:
     """Evaluate a profile about a unit axis at each pixel's centre, shape (H, W); 0 where there is no sightline."""
+    cosine, sine = _angles(camera, axis)
+    return np.where(np.isfinite(cosine), profile.at(cosine, sine), 0.0)
+
+
+@lru_cache(maxsize=1)
+def _angles(camera: Camera, axis: tuple[float, float, float]) -> tuple[Array, Array]:
+    """Return cosine and sine of the angle to a unit axis at each pixel's centre: a frame asks several times."""
     rays = camera.unproject(camera.pixel_centres())
     if axis == OPTICAL_AXIS:
-        cosine, sine = rays[..., 2], np.hypot(rays[..., 0], rays[..., 1])
-    else:
-        cosine, sine = rays @ np.array(axis), np.linalg.norm(np.cross(rays, axis), axis=-1)
-    return np.where(np.isfinite(cosine), profile.at(cosine, sine), 0.0)
+        return rays[..., 2].copy(), np.hypot(rays[..., 0], rays[..., 1])
+    return rays @ np.array(axis), np.linalg.norm(np.cross(rays, axis), axis=-1)

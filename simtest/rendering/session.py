@@ -84,7 +84,7 @@ class Session:
         self._load_surface(scene)
         self._set_camera(scene)
         self._built = self._build(self._structure())
-        self.update(scene)
+        self._move(scene)
 
     @property
     def mi(self) -> Any:
@@ -96,6 +96,11 @@ class Session:
     @_at_its_variant
     def update(self, scene: Scene) -> None:
         """Move to another scene; update only what changed, and rebuild only another structure."""
+        if scene != self.scene:
+            self._move(scene)
+
+    @_at_its_variant
+    def _move(self, scene: Scene) -> None:
         before = self.scene
         # Surface, camera and lights: refused here if they are not sound.
         if scene.placement != self.scene.placement:
@@ -126,7 +131,7 @@ class Session:
         except InputError:
             # Back to where it was, unless it is being made.
             if scene is not before:
-                self.update(before)
+                self._move(before)
             raise
 
     def _load_surface(self, scene: Scene) -> None:

@@ -115,6 +115,15 @@ def test_surface_hides_what_lies_behind_it(session):
     assert not session.truth().instrument.any()
 
 
+def test_same_scene_again_keeps_what_covers_the_frame(session):
+    session.update(described(SHAFT))
+    cover = session.cover()
+    session.update(described(SHAFT))
+    assert session.cover() is cover
+    session.update(described({**SHAFT, "tip": [0.6, 0.6]}))
+    assert not np.array_equal(session.cover().instrument, cover.instrument)
+
+
 def test_depth_share_is_that_of_the_surface_at_the_tip(session):
     shaft = {"tip": [0.7, 0.3], "diameter_mm": 3.0}
     session.update(described({**shaft, "depth_share": 0.5}))
