@@ -111,9 +111,15 @@ def check_motion(scene: Scene, surface: SurfaceModel) -> None:
 def _check_rims(scene: Scene, surface: SurfaceModel, positions: Array) -> None:
     """Raise `InputError` where the rim of a source, or what it encloses, touches tissue."""
     rims = {i: _rim_points(light, positions[i]) for i, light in enumerate(scene.rig.lights) if light.source}
-    # Next to the free camera nothing has to be looked up.
-    farthest = max((np.linalg.norm(points, axis=1).max() for points in rims.values()), default=0.0)
-    if farthest < surface.free_mm(surface.model_from_camera[:3, 3]) or not rims:
+    # Next to the free camera, or to the source's own free middle, nothing has to be looked up.
+    pose = surface.model_from_camera
+    free = surface.free_mm(pose[:3, 3])
+    rims = {i: points for i, points in rims.items() if np.linalg.norm(points, axis=1).max() >= free}
+    for i in [i for i in rims if _clearances(surface, positions[i : i + 1])[0] > 0]:
+        reach = np.linalg.norm(rims[i] - positions[i], axis=1).max()
+        if reach < surface.free_mm(pose[:3, :3] @ positions[i] + pose[:3, 3]):
+            del rims[i]
+    if not rims:
         return
     every = _clearances(surface, np.concatenate(list(rims.values())))
     ends = np.cumsum([len(points) for points in rims.values()])[:-1]

@@ -548,6 +548,9 @@ def test_a_frame_that_no_light_reaches_is_dark(session):
         assert not any(h.lit for h in session.highlights(frame.radiance))
 
 
+COLON = {"type": "anatomy", "path": "colon", "viewpoint": 1}
+"""38 mm aside of its camera the wall is 0.6 mm away."""
+
 TOUCHING = {
     "disc in a plane": ({"type": "plane"}, {"position_mm": [0, 0, 9.5], "direction": [1, 0, 0], "source": DISC}),
     "rim of a tilted disc": ({"type": "plane"}, {"position_mm": [0, 0, 9], "direction": [1, 0, 1], "source": DISC}),
@@ -558,6 +561,8 @@ TOUCHING = {
         {"type": "cylinder", "radius_mm": 12.0, "side": "inside"},
         {"position_mm": [0, 1.0, 9], "direction": [1, 0, 0], "source": DISC},
     ),
+    "disc through the wall of a mesh": (COLON, {"position_mm": [0, 38.0, 0], "source": DISC}),
+    "disc beyond the wall of a mesh": (COLON, {"position_mm": [0, 60.0, 0], "source": DISC}),
 }  # fmt: skip
 
 
@@ -574,6 +579,7 @@ def test_sources_that_touch_tissue_are_refused(session, name):
 def test_a_source_in_free_space_next_to_tissue_is_taken(session):
     session.update(scene([{"position_mm": [0, 0, 9.9], "source": DISC}]))
     session.update(scene([{"position_mm": [0, 0, 7.9], "direction": [1, 0, 0], "source": DISC}]))
+    session.update(scene([{"position_mm": [0, 34.0, 0], "source": DISC}], COLON))
 
 
 # Export --------------------------------------------------------------------------------------------------------------
