@@ -196,11 +196,11 @@ def _planes(values: Image) -> Sequence[Image]:
 
 def falloff_map(camera: Camera, profile: AngularProfile, axis: tuple[float, float, float] = OPTICAL_AXIS) -> Array:
     """Evaluate a profile about a unit axis at each pixel's centre, shape (H, W); 0 where there is no sightline."""
-    cosine, sine = _angles(camera, axis)
+    cosine, sine = _angles(camera, tuple(axis))
     return np.where(np.isfinite(cosine), profile.at(cosine, sine), 0.0)
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)
 def _angles(camera: Camera, axis: tuple[float, float, float]) -> tuple[Array, Array]:
     """Return cosine and sine of the angle to a unit axis at each pixel's centre: a frame asks several times."""
     rays = camera.unproject(camera.pixel_centres())

@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.dataset.index import HIGHLIGHTS, SAMPLES, TABLES
-from simtest.dataset.manifest import Manifest
+from simtest.dataset.manifest import NAME, Manifest
 from simtest.dataset.metadata import has_relief
 from simtest.dataset.plan import Plan
 from simtest.dataset.reader import open_manifest, read_samples, read_table, shard_names
@@ -108,6 +108,8 @@ def write_preview(folder: Path, page: Path, count: int = 24) -> Path:
     index = read_table(folder / SAMPLES)
     # A file of them after the other, since all highlights may be more than memory holds.
     files = [folder / name for name in manifest.tables if name.startswith(HIGHLIGHTS)]
+    if not files:
+        raise InputError(f"{folder / NAME}: lists no file of {HIGHLIGHTS}; simtest dataset verify --repair mends it")
     columns = ["index", "isolated", "distance_mm", "kd_min", "kd_max"]
     isolated = pl.concat(read_table(file, columns).filter(pl.col("isolated")) for file in files)
     # samples, evenly over the dataset, and the shards that hold them

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO
 
 from simtest.dataset.card import CARD, write_card
-from simtest.dataset.index import SAMPLES, shard_files, shortfall, write_index, write_shard_tables
+from simtest.dataset.index import FOLDERS, SAMPLES, shard_files, shortfall, write_index, write_shard_tables
 from simtest.dataset.maker import Maker
 from simtest.dataset.manifest import (
     NAME,
@@ -132,8 +132,9 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
         manifest.complete = True
         manifest.save(folder)
     # the index's rows of single shards, and parts of interrupted runs
-    for left in (*folder.glob(f"*{PART}*"), *folder.glob(f"*.parquet/*{PART}*")):
-        left.unlink(missing_ok=True)
+    for held in (folder, *(folder / name for name in FOLDERS)):
+        for left in held.glob(f"*{PART}*"):
+            left.unlink(missing_ok=True)
     return few
 
 

@@ -103,10 +103,12 @@ def _files(folder: Path, manifest: Manifest, plan: Plan) -> Iterator[Fault]:
         yield Fault(name, "not finished; the dataset's command goes on with it")
     for name in sorted(set(manifest.shards) - planned):
         yield Fault(NAME, f"lists {name}, which the dataset does not have")
-    # Another version of simtest may write other tables.
-    if not planned - set(manifest.shards) and _is_of_this_code(manifest):
-        lacking = belonging - {*manifest.shards, *manifest.tables}
+    if not planned - set(manifest.shards):
+        # Another version of simtest may write other tables.
+        lacking = (belonging if _is_of_this_code(manifest) else {SAMPLES, CARD}) - {*manifest.shards, *manifest.tables}
         yield from (Fault(name, "missing in the manifest") for name in sorted(lacking))
+        if not (lacking or manifest.complete):
+            yield Fault(CARD, "not finished; the dataset's command goes on with it")
     # files against manifest
     for name, entry in {**manifest.shards, **manifest.tables}.items():
         yield from _against(folder, name, entry)
@@ -117,7 +119,7 @@ def _files(folder: Path, manifest: Manifest, plan: Plan) -> Iterator[Fault]:
         name = path.relative_to(folder).as_posix()
         if name in known:
             continue
-        if name.endswith(PART):
+        if PART in path.name:
             if not planned - set(manifest.shards):
                 yield Fault(name, "left over from a stopped run")
         else:

@@ -270,10 +270,12 @@ def _cell_figures(rows: pl.DataFrame, taken: int) -> Iterator[Figure]:
         if value is not None:
             yield quantity, unit, value, low, high, n
 
-    def share(quantity: str, of: pl.DataFrame, hits: pl.Expr) -> Iterator[Figure]:
-        held = of.select(hits.fill_null(False).alias("hit"))["hit"].to_numpy()
-        count, n = int(held.sum()), len(held)
-        return figure(quantity, "", count / n, n, share_interval(held, *units(of)))
+    def shares(of: pl.DataFrame, **hits: pl.Expr) -> Iterator[Figure]:
+        groups = units(of)
+        for hit in of.select(is_hit.fill_null(False).alias(quantity) for quantity, is_hit in hits.items()):
+            held = hit.to_numpy()
+            count, n = int(held.sum()), len(held)
+            yield from figure(hit.name, "", count / n, n, share_interval(held, *groups))
 
     found, frames = figures(rows), max(taken, rows["realisation"].n_unique())
     n, n_ok = found.n, found.n_ok
@@ -283,9 +285,8 @@ def _cell_figures(rows: pl.DataFrame, taken: int) -> Iterator[Figure]:
     yield from figure("n_ok", "", n_ok, n)
     if n:
         true, missed = rows.filter(IS_TRUE), pl.col("status") == "missed"
-        yield from share("failed", true, ~missed & (pl.col("status") != "ok"))
-        yield from share("missed", true, missed)
-        yield from share("unanswered", true, pl.col("status") != "ok")
+        unanswered = pl.col("status") != "ok"
+        yield from shares(true, failed=~missed & unanswered, missed=missed, unanswered=unanswered)
     yield from figure("false", "a frame", found.n_false / frames, frames)
     # Errors
     yield from figure("mean_deg", "deg", found.mean_deg, n_ok, found.ci95_deg)
@@ -296,7 +297,7 @@ def _cell_figures(rows: pl.DataFrame, taken: int) -> Iterator[Figure]:
         yield from figure("n_instrument", "", found.n_instrument, rows.height)
     if found.coverage95 is not None:
         with_region = rows.filter(IS_TRUE & (pl.col("status") == "ok") & pl.col("mahalanobis2").is_not_null())
-        yield from share("coverage95", with_region, pl.col("mahalanobis2") <= COVERED)
+        yield from shares(with_region, coverage95=pl.col("mahalanobis2") <= COVERED)
     # Axis ratios against their law
     known = rows.with_columns(off=RATIO_OFF).drop_nulls("off")
     if known.height:

@@ -96,12 +96,14 @@ class Session:
     @_at_its_variant
     def update(self, scene: Scene) -> None:
         """Move to another scene; update only what changed, and rebuild only another structure."""
-        if scene != self.scene:
+        if scene != self.scene or not self._settled:
             self._move(scene)
 
     @_at_its_variant
     def _move(self, scene: Scene) -> None:
         before = self.scene
+        # Whatever ends this early, the next update writes all again.
+        self._settled = False
         # Surface, camera and lights: refused here if they are not sound.
         if scene.placement != self.scene.placement:
             self._load_surface(scene)
@@ -133,6 +135,7 @@ class Session:
             if scene is not before:
                 self._move(before)
             raise
+        self._settled = True
 
     def _load_surface(self, scene: Scene) -> None:
         # A malformed surface raises here, and the session stays at its scene.

@@ -277,7 +277,7 @@ class TubeKernel:
             bend, twist = bend * speed, twist * dr.square(speed) + bend * gain
         # Polynomials about the nearest knot; x and z stand side by side.
         knot = dr.clip(dr.round((u - start) / n["spacing"]), 0, n["last_knot"])
-        start_x, start_z, *powers = self._panels.row(mi.UInt32(knot))
+        start_x, start_z, *powers = self._panels.row(_bounded(knot, n["last_knot"]))
         share = (u - start - knot * n["spacing"]) / (n["spacing"] / 2)
         x, z = powers[-2], powers[-1]
         for i in range(len(powers) - 4, -1, -2):
@@ -327,7 +327,7 @@ class TubeKernel:
                 parts += [p + e for p, e in zip((eu * eu, eu * ev, ev * ev), forms, strict=True)]
             return i + 1, *(total - bump * part for total, part in zip(sums, parts, strict=True))
 
-        cell = mi.UInt32(dr.clip((u - n["least"]) * (CELLS / (n["most"] - n["least"])), 0, CELLS - 1))
+        cell = _bounded((u - n["least"]) * (CELLS / (n["most"] - n["least"])), CELLS - 1)
         first, last = (dr.gather(mi.UInt32, self._first, cell + k) for k in range(2))
         sums = self._summed(fold, first, last, sums)
 
@@ -380,6 +380,11 @@ class TubeKernel:
         names = ("i", *(f"sum_{i}" for i in range(len(sums))))
         state = (first, *(mi.Float64(part) for part in sums))
         return list(dr.while_loop(state, lambda i, *_: i < last, term, labels=names)[1:])
+
+
+def _bounded(number: Any, last: Any) -> Any:
+    """Return the whole part of numbers, mitsuba.UInt32, from 0 to the last: also of the NaN of lanes given up."""
+    return dr.minimum(mi.UInt32(dr.maximum(number, 0)), mi.UInt32(last))
 
 
 def _lists(numbers: TubeNumbers) -> tuple[IntArray, IntArray]:

@@ -183,10 +183,8 @@ def units(rows: pl.DataFrame) -> tuple[IntArray, IntArray]:
     """
     strata = FRAME[:-1]
     groups = (*strata, ANATOMY) if ANATOMY in rows.columns else FRAME
-    frames, settings = (
-        (rows.select(pl.struct(columns).rank("dense")).to_series().to_numpy().astype(int) - 1)
-        for columns in (groups, strata)
-    )
+    numbers = rows.select(frames=pl.struct(groups).rank("dense"), settings=pl.struct(strata).rank("dense"))
+    frames, settings = (number.to_numpy().astype(int) - 1 for number in numbers)
     return frames, settings
 
 

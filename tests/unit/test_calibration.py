@@ -78,6 +78,12 @@ def test_a_whole_file_is_read(tmp_path, name, camera):
     )
 
 
+@pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (0.0, 0.6, 0.8)])
+def test_an_emission_axis_may_be_a_list(axis):
+    one, other = (Calibration(CAMERA, emission=AngularProfile(2.0), emission_axis=kind(axis)) for kind in (tuple, list))
+    np.testing.assert_array_equal(one.falloff, other.falloff)
+
+
 @pytest.mark.parametrize("text", [CAMERA_TABLE, FLAT])
 def test_a_camera_file_is_a_calibration_of_nothing_else(tmp_path, text):
     read = load_calibration(write(tmp_path, text))

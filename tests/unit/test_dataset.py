@@ -777,6 +777,13 @@ def new_card(folder):
     honest(folder, "README.md")
 
 
+def unfinished(folder):
+    """As a kill before the last save leaves it."""
+    manifest = read_manifest(folder)
+    manifest.complete = False
+    manifest.save(folder)
+
+
 def first(change):
     """Change the members of the first sample."""
     return lambda folder: rewrite(folder, TAR, lambda s: [(s[0][0], change(dict(s[0][1])), s[0][2]), *s[1:]])
@@ -818,6 +825,7 @@ DAMAGE = {
     "foreign file among the highlights": (lambda f: (f / f"{HIGHLIGHTS}/mine").touch(), f"{HIGHLIGHTS}/mine"),
     "folder of the highlights is a link": (link_highlights, HIGHLIGHTS),
     "edited card": (new_card, "README.md"),
+    "not finished": (unfinished, "README.md"),
     "normals turned away": (with_image("normal", lambda n: put(n, (0.0, 0.0, 1.0))), TAR),
     "normals of another frame": (with_image("normal", lambda n: n * np.array([-1, 1, 1])), TAR),
     "holes in the depth": (with_image("depth", lambda d: put(d, np.nan)), TAR),
@@ -842,6 +850,26 @@ def test_damage_is_found_and_named(copy, damage, named):
 
 
 BY_HASH = "differs from its SHA-256 in the manifest"
+
+
+def test_leftovers_of_rows_are_told_and_removed_and_foreign_folders_stay(copy, made):
+    left, mine = copy / HIGHLIGHTS / ".train-000000.7.part.parquet", copy / "mine.parquet" / "a.part.csv"
+    left.touch()
+    assert list(map(str, verify(copy))) == [f"{HIGHLIGHTS}/{left.name}: left over from a stopped run"]
+    mine.parent.mkdir()
+    mine.touch()
+    write_dataset(tiny(**SIX), copy, make_engine())
+    assert mine.exists()
+    shutil.rmtree(mine.parent)
+    assert contents(copy) == contents(made)
+
+
+def test_a_preview_needs_the_rows_of_highlights(copy, tmp_path):
+    manifest = read_manifest(copy)
+    manifest.tables = {name: entry for name, entry in manifest.tables.items() if not name.startswith(HIGHLIGHTS)}
+    manifest.save(copy)
+    with pytest.raises(InputError, match=r"manifest.json: lists no file of highlights.parquet; simtest dataset verify"):
+        write_preview(copy, tmp_path / "page.html", 4)
 
 
 def test_each_file_is_held_against_its_hash(copy):

@@ -142,6 +142,24 @@ def test_a_stopped_frame_and_a_refused_scene_leave_the_session_whole(monkeypatch
     assert plain(session.radiance()) == whole
 
 
+@pytest.mark.parametrize("stage", ["_set_camera", "_write_values"])
+@pytest.mark.parametrize("after", [0, 1], ids=["back", "again"])
+def test_a_stopped_update_is_made_whole_by_the_next(stage, after, monkeypatch):
+    scenes, made = (scene(ROUGH), scene(ROUGH, exponent=20.0, cx=25.0)), getattr(Session, stage)
+    session = Session(scenes[0])
+
+    def stop(self, *arguments):
+        made(self, *arguments)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Session, stage, stop)
+        with pytest.raises(KeyboardInterrupt):
+            session.update(scenes[1])
+    session.update(scenes[after])
+    assert plain(session.radiance()) == plain(Session(scenes[after]).radiance())
+
+
 _TWO_VARIANTS = """
 import numpy as np
 from simtest.rendering import Session
