@@ -132,7 +132,7 @@ ROWS = (
     row("exponent of sRGB 2.2, both ways", "sensor curve", "calibration.photometry:srgb_encode", "** (1 / 2.4)",
         "** (1 / 2.2)", "sensor camera_stages calibration",
         also=(("calibration.photometry:srgb_decode", "** 2.4)", "** 2.2)"),)),
-    row("vignetting about the image's first pixel", "vignetting", "calibration.calibration:falloff_map",
+    row("vignetting about the image's first pixel", "vignetting", "calibration.calibration:_angles",
         "camera.unproject(camera.pixel_centres())", "camera.unproject(camera.pixel_centres() + [camera.cx / 4, 0.0])",
         "sensor_scenes calibration fast_ways"),
     row("standard deviation of a uniform prior is half its width", "units", "calibration.priors:Uniform.sd",
