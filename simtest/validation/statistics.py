@@ -3,6 +3,7 @@
 Whoever counts rows counts these kinds, so that all counts agree and add up.
 """
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -135,21 +136,22 @@ def summarise(results: pl.DataFrame) -> dict[str, dict[str, Figures]]:
 
 def figures(rows: pl.DataFrame) -> Figures:
     """Compute the figures of the rows of one setting and estimator."""
-    count = rows.select(**counts(rows)).row(0, named=True)
-    answered = rows.filter(row_kind(rows) == "ok")
-    failed = rows.filter(row_kind(rows) == "failed")["status"].value_counts()
+    # Once: there are many settings, and an expression costs more than their few rows.
+    kinds = rows.select(row_kind(rows)).to_series()
+    count, answered = Counter(kinds.to_list()), rows.filter(kinds == "ok")
+    n, failed = count["ok"] + count["failed"] + count["missed"], Counter(rows["status"].filter(kinds == "failed"))
     # Errors of the answers, and the penalty of the others.
     errors = answered["error_deg"].to_numpy()
-    penalised = np.concatenate([errors, np.full(count["true"] - len(errors), PENALTY_DEG)])
+    penalised = np.concatenate([errors, np.full(n - len(errors), PENALTY_DEG)])
     distances = answered["mahalanobis2"].drop_nulls().to_numpy()
     stated = answered.drop_nulls("cov_11")
     variances = (stated["cov_11"] + stated["cov_22"]).to_numpy()
     wrong = is_wrong_and_sure(stated["error_deg"].to_numpy(), np.degrees(np.sqrt(variances.clip(0))))
     low, high = mean_interval(errors, *units(answered))
     return Figures(
-        n=count["true"],
+        n=n,
         n_ok=count["ok"],
-        n_failed_by_reason=dict(sorted(failed.iter_rows())),
+        n_failed_by_reason=dict(sorted(failed.items())),
         n_missed=count["missed"],
         n_false=count["false"],
         n_in_spot=count["in_spot"],
