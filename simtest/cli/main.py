@@ -22,13 +22,14 @@ NARROWEST = 20
 """Columns of a terminal; tables and help cannot be laid out in fewer."""
 
 LATER_S = 0.01
-"""After so long a stop that came within an import is tried again."""
+"""After so long a stop that had to wait is tried again."""
 
 
 class Termination:
     """Answers SIGTERM as Ctrl-C is answered, and remembers that it came.
 
-    Within an import both wait for its end: an exception there can be swallowed, or break a library for good.
+    Within an import both wait for its end: an exception there can be swallowed, or break a library for good. So they do
+    while pydantic builds a model, which makes another error of it.
     """
 
     def __init__(self) -> None:
@@ -38,7 +39,8 @@ class Termination:
     def __enter__(self) -> "Termination":
         """Answer the signals from now on; in a thread, which gets none, nothing is done."""
         if threading.current_thread() is threading.main_thread():
-            numbers = [signal.SIGTERM, signal.SIGALRM]
+            # The alarm first, by which another waits.
+            numbers = [signal.SIGALRM, signal.SIGTERM]
             # Ignored by nohup, and in the background of a script: then it stays so.
             if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
                 numbers.append(signal.SIGINT)
@@ -52,7 +54,7 @@ class Termination:
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self.came = self.came or number == signal.SIGTERM
-        if _importing(frame):
+        if _loading(frame):
             signal.setitimer(signal.ITIMER_REAL, LATER_S)
             return
         # A progress bar, which answers Ctrl-C itself, waits for the end of its step.
@@ -63,10 +65,14 @@ class Termination:
             raise KeyboardInterrupt
 
 
-def _importing(frame: FrameType | None) -> bool:
-    """Return whether a module is being imported."""
+BUILDING = frozenset({"complete_model_class", "complete_dataclass", "_init_core_attrs"})
+"""Functions of pydantic that build what validates."""
+
+
+def _loading(frame: FrameType | None) -> bool:
+    """Return whether a module is being imported, or a model built."""
     while frame is not None:
-        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>" or frame.f_code.co_name in BUILDING:
             return True
         frame = frame.f_back
     return False
@@ -125,17 +131,17 @@ def main() -> None:
     SIGTERM. Of `nightly`, whose 1 is a regression or an unexplained change, whatever else went wrong is 2. A reader of
     the output that has gone is no error.
     """
-    with Termination() as stop:
-        try:
+    stop = Termination()
+    # Around it: a signal may come as soon as the first is answered.
+    try:
+        with stop:
             _mend_terminal()
             code = _run()
-        except KeyboardInterrupt as stopped:
-            goes_on = " ".join(sys.argv[1:3]).startswith(GOING_ON)
-            kept = (
-                f"what is finished is kept, and the same command {'goes on from there' if goes_on else 'begins anew'}"
-            )
-            _report(f"{'terminated' if stop.came else 'stopped'}; {str(stopped) or kept}", 0)
-            code = TERMINATED if stop.came else INTERRUPTED
+    except KeyboardInterrupt as stopped:
+        goes_on = " ".join(sys.argv[1:3]).startswith(GOING_ON)
+        kept = f"what is finished is kept, and the same command {'goes on from there' if goes_on else 'begins anew'}"
+        _report(f"{'terminated' if stop.came else 'stopped'}; {str(stopped) or kept}", 0)
+        code = TERMINATED if stop.came else INTERRUPTED
     sys.exit(code)
 
 

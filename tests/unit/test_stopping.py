@@ -74,6 +74,54 @@ def test_a_stop_within_an_import_waits_for_its_end(tmp_path, number, came):
     assert (done.stdout.split(), done.stderr) == (["imported", "stopped", str(came)], "")
 
 
+def test_a_stop_within_the_building_of_a_model_waits_for_its_end():
+    done = script("""
+        import signal, time
+        from pydantic import BaseModel, ConfigDict
+        from pydantic_core import core_schema
+        from simtest.cli.main import Termination
+
+        class Slow:
+            @classmethod
+            def __get_pydantic_core_schema__(cls, *_):
+                signal.raise_signal(signal.SIGTERM)
+                return core_schema.any_schema()
+
+        class Held(BaseModel):
+            model_config = ConfigDict(defer_build=True)
+            slow: Slow
+
+        try:
+            with Termination():
+                print(Held(slow=1).slow)
+                time.sleep(5)
+        except KeyboardInterrupt:
+            print("stopped")
+    """)
+    assert (done.stdout.split(), done.stderr) == (["1", "stopped"], "")
+
+
+@pytest.mark.parametrize("after", ["SIGALRM", "SIGTERM"])
+def test_a_stop_as_soon_as_signals_are_answered_is_one_line(after):
+    done = script(f"""
+        import signal, sys
+        from simtest.cli.main import main
+        answer = signal.signal
+
+        def answered_at_once(number, answerer):
+            before = answer(number, answerer)
+            if number == signal.{after}:
+                signal.raise_signal(signal.SIGTERM)
+            return before
+
+        signal.signal, sys.argv = answered_at_once, ["simtest", "schema"]
+        main()
+    """)
+    # Before SIGTERM is answered the system ends the process.
+    ends = (-signal.SIGTERM, "") if after == "SIGALRM" else (TERMINATED, "simtest: terminated")
+    assert (done.returncode, done.stderr.partition(";")[0]) == ends
+
+
 def test_a_stop_while_the_command_is_loaded_is_one_line():
     process = subprocess.Popen([sys.executable, "-X", "importtime", "-c", MAIN, "schema"], stdout=subprocess.PIPE,
                                stderr=subprocess.PIPE, text=True)  # fmt: skip
